@@ -1,0 +1,207 @@
+"""`demobench.toml` → frozen, checked settings. Unknown names answer with "did you mean".
+
+What belongs here: the shape of the file, its defaults, and turning command-line choices into the settings of one run.
+What does not: reading data, anything with torch in it.
+"""
+
+import hashlib
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from pipeline.errors import ConfigError, did_you_mean
+from pipeline.types import ActionKind, Protocol
+
+BUDGETS = {"quick": 600, "standard": 3_000, "thorough": 20_000}
+"""Training steps of each named budget."""
+
+SLUG = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]{0,79}")
+BudgetName = Literal["quick", "standard", "thorough"]
+
+
+class Settings(BaseModel):
+    """Base of every block of the file: frozen, and an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class StoreConfig(Settings):
+    path: str = "results"
+
+    @model_validator(mode="after")
+    def _is_a_folder(self):
+        if "://" in self.path:
+            raise ConfigError(
+                f"[store] path is '{self.path}', a URL. Results are kept in a folder: give a path, for example \"results\"."
+            )
+        return self
+
+
+class TrackingConfig(Settings):
+    mlflow: str = "sqlite"
+
+    @model_validator(mode="after")
+    def _known_kind(self):
+        if self.mlflow != "sqlite" and not re.match(r"https?://", self.mlflow):
+            raise ConfigError(
+                f"[tracking] mlflow is '{self.mlflow}'. It is \"sqlite\" (a file in the store) or a server, "
+                'for example "http://127.0.0.1:5000".'
+            )
+        return self
+
+
+class BenchmarkConfig(Settings):
+    protocol: Protocol = "strict"
+    history: Annotated[int, Field(ge=1, le=1000)] = 3
+    seeds: Annotated[int, Field(ge=1, le=1000)] = 5
+    test_share: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    folds: Annotated[int, Field(ge=1, le=100)] | Literal["auto"] = "auto"
+    budget: BudgetName = "standard"
+    steps: Annotated[int, Field(ge=1)] | None = None
+    rollouts: Annotated[int, Field(ge=1)] = 50
+    split_seed: Annotated[int, Field(ge=0)] = 0
+    threads: Annotated[int, Field(ge=1, le=256)] = 2
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    executor: Literal["in_process"] = "in_process"
+
+
+class DatasetConfig(Settings):
+    source: str
+    simulator: Literal["pusht"] | None = None
+    budget: BudgetName | None = None
+    kind: Literal["auto"] | ActionKind | dict[str, ActionKind] = "auto"
+    circular: tuple[str, ...] | None = None
+    observations: dict[str, tuple[str, ...]] = {"state": ("observation.state",)}
+
+
+class PolicyConfig(Settings):
+    method: str
+    chunks: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = ()
+    observations: Literal["all"] | tuple[str, ...] = "all"
+    only_when_named: bool = False
+
+
+class ScheduleConfig(Settings):
+    cron: str = "0 3 * * 1"
+
+
+BASELINES = {
+    name: PolicyConfig(method=name)
+    for name in ("hold_still", "mean_action", "constant_velocity", "nearest_neighbour")
+}
+"""Always in a benchmark; a file need not name them."""
+
+DEFAULT_POLICIES = {
+    "mlp": PolicyConfig(method="mlp", chunks=(1, 4, 16, 32)),
+    "notebook_pusht": PolicyConfig(method="notebook_pusht", only_when_named=True),
+}
+PUSHT_SIM = DatasetConfig(
+    source="embedded:pusht_sim",
+    simulator="pusht",
+    budget="quick",
+    kind="position",
+    observations={
+        "position": ("observation.state",),
+        "pose": ("observation.state", "observation.environment_state"),
+    },
+)
+
+
+class Config(Settings):
+    """The whole file. What a file leaves out has the defaults of the `demobench.toml` that ships with the project."""
+
+    store: StoreConfig = StoreConfig()
+    tracking: TrackingConfig = TrackingConfig()
+    benchmark: BenchmarkConfig = BenchmarkConfig()
+    datasets: dict[str, DatasetConfig] = {"pusht_sim": PUSHT_SIM}
+    policies: dict[str, PolicyConfig] = DEFAULT_POLICIES
+    schedule: ScheduleConfig = ScheduleConfig()
+
+    @model_validator(mode="after")
+    def _names_are_slugs(self):
+        for kind, names in (("datasets", self.datasets), ("policies", self.policies)):
+            for name in names:
+                check_slug(name, f"[{kind}.{name}]")
+        return self
+
+
+def check_slug(name: str, where: str) -> str:
+    """Names become folders and Dagster partition keys, so they must be harmless: letters, digits, `_ . + -`, no `..`."""
+    if not SLUG.fullmatch(name) or ".." in name:
+        raise ConfigError(
+            f"{where}: '{name}' cannot be a name. Names start with a letter or digit, hold only letters, digits, '_', '.', "
+            "'+' and '-', at most 80 of them, and no '..'."
+        )
+    return name
+
+
+def load_config(path: Path | None) -> Config:
+    """Read and check a file; `None` gives the built-in defaults.
+
+    Raises:
+        ConfigError: no such file, not TOML, an unknown key, a value out of range.
+    """
+    if path is None:
+        return Config()
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"No configuration file at {path}. Leave --config out to use the built-in defaults.") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read as TOML: {error}.") from None
+    return parse_config(raw, str(path))
+
+
+def parse_config(raw: dict[str, Any], where: str) -> Config:
+    """Check a dictionary as `tomllib` returns it. `where` names the file in messages."""
+    try:
+        config = Config.model_validate(raw)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    except ValidationError as error:
+        raise ConfigError(f"{where}: {_first_problem(error)}") from None
+    from pipeline.policies import METHODS
+
+    for name, policy in config.policies.items():
+        if policy.method not in METHODS:
+            raise ConfigError(
+                f"{where}: [policies.{name}] method '{policy.method}' does not exist. {did_you_mean(policy.method, METHODS)}"
+            )
+    return config
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    path = [str(part) for part in problem["loc"]]
+    if problem["type"] == "extra_forbidden":
+        known = _keys_at(path[:-1])
+        table = ".".join(path[:-1])
+        place = f"in [{table}]" if table else "at the top level"
+        return f"unknown key '{path[-1]}' {place}. {did_you_mean(path[-1], known)}"
+    return f"{'.'.join(path)}: {problem['msg']} (got {problem['input']!r})."
+
+
+def _keys_at(path: list[str]) -> list[str]:
+    """The keys that the file allows at a path such as ["datasets", "pusht_sim"]."""
+    blocks = {
+        "store": StoreConfig, "tracking": TrackingConfig, "benchmark": BenchmarkConfig,
+        "datasets": DatasetConfig, "policies": PolicyConfig, "schedule": ScheduleConfig,
+    }  # fmt: skip
+    model = blocks.get(path[0], Config) if path else Config
+    return list(model.model_fields)
+
+
+def hash_of(settings: Any) -> str:
+    """A short, stable name for JSON-able settings: the first 16 hex digits of their sha256."""
+    text = json.dumps(settings, sort_keys=True, separators=(",", ":"), default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    raise TypeError(f"{type(value).__name__} has no stable JSON form")

@@ -1,0 +1,256 @@
+"""Records that cross the borders between rooms. They hold and check; they compute next to nothing.
+
+The letters, the same everywhere:
+
+    N frames of a data set      E episodes          M anchors          B anchors of one batch
+    T frames of history         K actions a chunk   H horizons         S seeds
+    A action columns            P columns of `observation.state`        O columns of an observation set
+
+A *frame* is one row of a recording, an *episode* one demonstration. An *anchor* is the frame at which a policy is asked;
+horizon h = 0 is the action recorded at the anchor's own frame. Frames are numbered through the whole data set (0 … N−1,
+"global"); episodes by position (0 … E−1), not by the recorded `episode_index`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+ACTION = "action"
+STATE = "observation.state"
+
+ActionKind = Literal["position", "velocity", "delta", "other"]
+Protocol = Literal["strict", "notebook"]
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One feature of a data set: `names` and `units` have one entry a column; a unit is None where it is not known."""
+
+    key: str
+    names: tuple[str, ...]
+    units: tuple[str | None, ...]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera stream as `info.json` declares it. `present` says whether the files were there when it was read."""
+
+    key: str
+    height: int
+    width: int
+    codec: str | None
+    present: bool
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Demonstrations in memory: one array a feature, episodes one after another.
+
+    columns         feature key → [N, D] float32 (only features with numbers; never images)
+    features        feature key → names and units of its D columns
+    episode_starts  [E + 1] int64, episode e is frames episode_starts[e] … episode_starts[e + 1] − 1
+    episode_ids     [E] int64, the recorded `episode_index`
+    timestamps      [N] float64, seconds from the start of the episode, as recorded
+    tasks           the task of each episode, in words ("" where there is none)
+    revision        the Hub commit, where there is one
+    content_hash    sha256 over the arrays above, names and fps: equal for equal demonstrations whatever the file layout
+    warnings        what differed from the format's promises without making a number wrong
+    """
+
+    name: str
+    source: str
+    revision: str | None
+    fps: float
+    robot_type: str | None
+    columns: Mapping[str, np.ndarray]
+    features: Mapping[str, Feature]
+    episode_starts: np.ndarray
+    episode_ids: np.ndarray
+    timestamps: np.ndarray
+    tasks: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    warnings: tuple[str, ...]
+    content_hash: str
+
+    @property
+    def frames(self) -> int:
+        return int(self.episode_starts[-1])
+
+    @property
+    def episodes(self) -> int:
+        return len(self.episode_starts) - 1
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """[E] frames of each episode."""
+        return np.diff(self.episode_starts)
+
+    @property
+    def episode_of_frame(self) -> np.ndarray:
+        """[N] the position of the episode each frame belongs to."""
+        return np.repeat(np.arange(self.episodes), self.lengths)
+
+    @property
+    def frame_in_episode(self) -> np.ndarray:
+        """[N] each frame's number within its episode."""
+        return np.arange(self.frames) - np.repeat(self.episode_starts[:-1], self.lengths)
+
+    def episode(self, position: int) -> slice:
+        """The global frames of one episode."""
+        return slice(int(self.episode_starts[position]), int(self.episode_starts[position + 1]))
+
+
+@dataclass(frozen=True)
+class Semantics:
+    """What the columns mean, guessed or set (`lerobot_format.quality.resolve_semantics`).
+
+    kinds         [A] the kind of every action column
+    state_column  [A] the column of `observation.state` that a position or velocity action commands, else None
+    circular      feature key → [D] bool, true for angles that wrap; they enter networks and distances as sine and
+                  cosine, and errors on them are wrapped to (−π, π]
+    tracking_lag  [A] mean |a_t − s_t| over all frames for position columns, in their unit, else None
+    warnings      where a guess was unsure, dead columns, an uneven clock
+    """
+
+    kinds: tuple[ActionKind, ...]
+    state_column: tuple[int | None, ...]
+    circular: Mapping[str, tuple[bool, ...]]
+    tracking_lag: tuple[float | None, ...]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ObservationSet:
+    """The features a policy sees, by name: `pose = ["observation.state", "observation.environment_state"]`."""
+
+    name: str
+    features: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Episode positions, sorted, that train and that are held out. They never overlap."""
+
+    train: tuple[int, ...]
+    test: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Split:
+    """One or more folds, seeded; `hash` covers the content hash of the demonstrations and every fold."""
+
+    folds: tuple[Fold, ...]
+    seed: int
+    hash: str
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What policies are asked with, offline and in roll-outs alike; raw units, nothing normalised.
+
+    values           [B, T, O] the observation set's columns (features in the set's order), oldest frame first
+    state            [B, T, P] `observation.state`, for baselines that move the arm's own state; P may be 0
+    previous_action  [B, A] the action recorded one frame before; NaN at the first frame of an episode
+    anchors          [B] global frame numbers, or None in a roll-out
+    """
+
+    values: np.ndarray
+    state: np.ndarray
+    previous_action: np.ndarray
+    anchors: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """What one policy with one observation set predicted at every held-out anchor, raw units.
+
+    anchors  [M] global frames, fold by fold      fold  [M]
+    actions  [S, M, K, A] float32; K is the policy's chunk, or the longest horizon scored where it has none
+    """
+
+    policy: str
+    observations: str
+    seeds: tuple[int, ...]
+    anchors: np.ndarray
+    fold: np.ndarray
+    actions: np.ndarray
+
+    def in_frames(self, frames: slice) -> np.ndarray:
+        """Positions (into `anchors`) of the anchors inside a range of global frames, in time order."""
+        inside = np.flatnonzero((self.anchors >= frames.start) & (self.anchors < frames.stop))
+        return inside[np.argsort(self.anchors[inside], kind="stable")]
+
+
+@dataclass(frozen=True)
+class EpisodeErrors:
+    """Errors on held-out anchors, summed within each episode: every metric is made from these.
+
+    episodes  [E] positions      fold [E]       anchors [E, H] how many anchors have a target at horizon h
+    absolute  [S, E, H, A] Σ|error|             squared [S, E, H, A] Σ error²
+    l2        [S, E, H] Σ Euclidean norm of the error over action columns
+    scale     [E, A] standard deviation of the training actions of that episode's fold; NaN for dead columns
+    """
+
+    episodes: np.ndarray
+    fold: np.ndarray
+    anchors: np.ndarray
+    absolute: np.ndarray
+    squared: np.ndarray
+    l2: np.ndarray
+    scale: np.ndarray
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """The frames around one probe: global frames [n], their actions [n, A], the probe's own frame."""
+
+    probe: int
+    frames: np.ndarray
+    actions: np.ndarray
+
+
+@dataclass(frozen=True)
+class RadiusFloor:
+    """The notebook's floor (biased, kept to reproduce published numbers); NaN values where no probe counted.
+
+    probes             probes that had enough neighbours
+    median_neighbours  frames in the median group, the probe included
+    mean, p90          of the distances (L2) of actions to their own group's mean, in `unit`
+    """
+
+    observations: str
+    horizon: int
+    radius: float
+    scaled: bool
+    probes: int
+    median_neighbours: float
+    mean: float
+    p90: float
+    unit: str | None
+    crowded: Neighbourhood | None
+    refused: str | None
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """Closed-loop results of one policy (seed 0 of fold 0) from numbered start states.
+
+    start_states  [R] numbers       success [R] bool       best_reward [R] in 0 … 1       steps [R]
+    paths         [R, L, 2] where the end effector went (NaN after the end), for pictures; None where not two-dimensional
+    """
+
+    simulator: str
+    simulator_version: str
+    policy: str
+    observations: str
+    start_states: np.ndarray
+    success: np.ndarray
+    best_reward: np.ndarray
+    best_coverage: np.ndarray
+    steps: np.ndarray
+    paths: np.ndarray | None
