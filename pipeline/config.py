@@ -6,6 +6,7 @@ What does not: reading data, anything with torch in it.
 
 import hashlib
 import json
+import os
 import re
 import tomllib
 from pathlib import Path
@@ -205,3 +206,13 @@ def _plain(value: Any) -> Any:
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json")
     raise TypeError(f"{type(value).__name__} has no stable JSON form")
+
+
+def find_config(given: Path | None = None) -> Path | None:
+    """The file to use: the one given, else DEMOBENCH_CONFIG, else `demobench.toml` here; None for the built-in defaults."""
+    if given is not None:
+        return given.absolute()
+    if named := os.environ.get("DEMOBENCH_CONFIG"):
+        return Path(named).absolute()
+    here = Path("demobench.toml").absolute()
+    return here if here.exists() else None

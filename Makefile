@@ -1,0 +1,42 @@
+# make demo    the whole benchmark on the embedded data set
+# make test    the tests; make test-slow the long ones
+# make ui      Dagster and MLflow on 127.0.0.1
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: demo setup test test-slow ui speed lint clean
+
+demo: $(READY)
+	$(BIN)/demobench run pusht_sim
+
+setup: $(READY)
+
+# The constraints pin every version; pip's cache makes a second environment cheap.
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit("demobench needs Python 3.11 or newer; set PYTHON=…" if sys.version_info < (3, 11) else 0)'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[pusht,dev]'
+	touch $@
+
+test: $(READY)
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+test-slow: $(READY)
+	$(BIN)/python -m pytest -m slow
+
+ui: $(READY)
+	$(BIN)/demobench ui
+
+speed: $(READY)
+	$(BIN)/python -m speed
+
+lint: $(READY)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/lint-imports
+
+clean:
+	rm -rf results build dist *.egg-info

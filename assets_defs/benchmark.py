@@ -1,0 +1,155 @@
+"""The benchmark: one table of policies, baselines and floors, and one page that shows it."""
+
+from collections.abc import Sequence
+
+import dagster as dg
+
+from assets_defs.data import PARTITIONS, demonstrations, episode_split
+from assets_defs.plan import Unit
+from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
+from assets_defs.show import picture, present, table
+
+TABLE = dg.AssetKey(["benchmark_table"])
+REPORT = dg.AssetKey(["benchmark_report"])
+
+
+def benchmark_assets(deps: Sequence[dg.AssetKey], floor: dg.AssetsDefinition) -> list[dg.AssetsDefinition]:
+    """The table and the page; `deps` are the predictions and roll-outs of every policy."""
+    benchmark_table = _benchmark_table(deps, floor)
+    return [benchmark_table, _benchmark_report(benchmark_table)]
+
+
+def _benchmark_table(deps: Sequence[dg.AssetKey], floor: dg.AssetsDefinition) -> dg.AssetsDefinition:
+    @dg.asset(
+        key=TABLE,
+        partitions_def=PARTITIONS,
+        group_name="benchmark",
+        kinds={"json"},
+        deps=[demonstrations, episode_split, floor, *deps],
+        code_version=code_version("benchmark_table"),
+        check_specs=[
+            check_spec(TABLE, "baselines_present", "Hold-still is in the table: every error is read against it."),
+            check_spec(TABLE, "same_data", "Every row was computed from the same demonstrations and split."),
+        ],
+    )
+    def benchmark_table(
+        context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
+    ) -> dg.MaterializeResult:
+        """Policies and baselines side by side, on the same held-out episodes, with intervals over episodes.
+
+        It holds every result that is up to date, whichever run made it.
+        """
+        bench = workbench.open(context, budget)
+        made = bench.make(Unit("benchmark_table"), lambda draft: _write_table(bench, draft))
+        header = ["policy", "observations", "first-step MAE", "interval", "× hold-still", "success"]
+        metadata = {
+            "table": table(header, made.summary["rows"]),
+            "protocol": bench.experiment.protocol,
+            "budget": bench.experiment.budget_words,
+            **{f"first_step_mae_{row[0]}_{row[1]}": float(row[2]) for row in made.summary["rows"] if row[2] is not None},
+        }
+        return result(bench, TABLE, {"": made}, metadata, ["baselines_present", "same_data"])
+
+    return benchmark_table
+
+
+def _write_table(bench: Bench, draft) -> Outcome:
+    from pipeline.statistics.floors import load_floors
+    from pipeline.store import write_json
+    from pipeline.table import build_table
+
+    plan = bench.plan
+    entries = []
+    for unit in plan.fresh_policy_units("predictions"):
+        name = unit.asset.split("/")[0]
+        trained = bench.summary(Unit(f"{name}/trained_policy", unit.entry))
+        rolled = Unit(f"{name}/rollouts", unit.entry)
+        entries.append(
+            {
+                "variant": next(v for v in plan.variants if v.name == name),
+                "observations": unit.entry,
+                **bench.summary(unit),
+                "parameters": trained["parameters"],
+                "train_s": trained["train_s"],
+                "rollouts": bench.summary(rolled).get("rollouts") if plan.is_fresh(rolled) else None,
+            }
+        )
+    floors = load_floors(plan.folder(Unit("multimodality_floor")) / "floors.json")
+    facts = bench.summary(Unit("demonstrations"))["inspect"]
+    built = build_table(facts, bench.experiment, bench.split, floors, entries)
+    write_json(draft / "table.json", built)
+    rows = [
+        (
+            row["policy"],
+            row["observations"],
+            row["first_step_mae"],
+            _words(row["interval"].get("first_step_mae")),
+            row["vs_hold_still"],
+            row["rollouts"]["success"] if row["rollouts"] else None,
+        )
+        for row in built["policies"]
+    ]
+    names = {row["policy"] for row in built["policies"]}
+    hashes = {entry["split_hash"] for entry in entries}
+    return Outcome(
+        {"rows": rows},
+        {
+            "baselines_present": ("hold_still" in names, f"{len(rows)} rows"),
+            "same_data": (hashes == {bench.split.hash}, f"split {bench.split.hash[:16]}"),
+        },
+    )
+
+
+def _words(interval: Sequence[float] | None) -> str | None:
+    return f"{interval[0]:.4g} … {interval[1]:.4g}" if interval else None
+
+
+def _benchmark_report(benchmark_table: dg.AssetsDefinition) -> dg.AssetsDefinition:
+    @dg.asset(
+        key=REPORT,
+        partitions_def=PARTITIONS,
+        group_name="benchmark",
+        kinds={"html", "altair"},
+        deps=[benchmark_table],
+        code_version=code_version("benchmark_report"),
+        check_specs=[check_spec(REPORT, "self_contained", "The page asks for nothing from the network.")],
+    )
+    def benchmark_report(
+        context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
+    ) -> dg.MaterializeResult:
+        """One page, one file, no network: the table, the pictures that explain it, and how to make it again."""
+        bench = workbench.open(context, budget)
+        unit = Unit("benchmark_report")
+        made = bench.make(unit, lambda draft: _write_report(bench, draft))
+        page = bench.plan.folder(unit) / "report.html"
+        metadata = {
+            "page": dg.MetadataValue.path(str(page)),
+            "link": dg.MetadataValue.url(page.as_uri()),
+            "size_mb": made.summary["size_mb"],
+            "errors": picture(bench.plan.folder(unit) / "errors.png"),
+        }
+        return result(bench, REPORT, {"": made}, present(metadata), ["self_contained"])
+
+    return benchmark_report
+
+
+def _write_report(bench: Bench, draft) -> Outcome:
+    import json
+
+    from pipeline.predict import load_predictions
+    from pipeline.sinks import charts
+    from pipeline.sinks.report import outside_references, write_report
+    from pipeline.statistics.floors import load_floors
+
+    plan = bench.plan
+    built = json.loads((plan.folder(Unit("benchmark_table")) / "table.json").read_text())
+    predictions = [load_predictions(plan.folder(u)) for u in plan.fresh_policy_units("predictions")]
+    floors = load_floors(plan.folder(Unit("multimodality_floor")) / "floors.json")
+    page = draft / "report.html"
+    write_report(page, built, bench.demonstrations, bench.semantics, bench.split, predictions, floors)
+    charts.write_png(charts.error_over_horizon(built), draft / "errors.png")
+    outside = outside_references(page)
+    return Outcome(
+        {"size_mb": round(page.stat().st_size / 1e6, 2)},
+        {"self_contained": (not outside, "; ".join(outside) or "no outside reference")},
+    )

@@ -1,0 +1,202 @@
+"""The first assets: demonstrations at a pinned revision, the split by episode, and the windows cut from it."""
+
+import json
+
+import dagster as dg
+
+from assets_defs.plan import Unit
+from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
+from assets_defs.show import picture, present, table
+
+PARTITIONS = dg.DynamicPartitionsDefinition(name="datasets")
+GROUP = "data"
+
+
+def key(name: str) -> dg.AssetKey:
+    return dg.AssetKey([name])
+
+
+@dg.asset(
+    partitions_def=PARTITIONS,
+    group_name=GROUP,
+    kinds={"lerobot", "parquet"},
+    code_version=code_version("demonstrations"),
+    check_specs=[
+        check_spec(key("demonstrations"), "stored_as_read", "What lies in the store has the content hash of what was read."),
+        check_spec(key("demonstrations"), "counts", "Every episode has frames, and they add up to the whole."),
+    ],
+)
+def demonstrations(
+    context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
+) -> dg.MaterializeResult:
+    """What people showed the robot: every episode of a LeRobot data set, read at a pinned revision.
+
+    One array a feature, episodes one after another. The content hash is the data set's identity: everything that is
+    computed from it carries this hash, so two results can be compared only when it is the same.
+    """
+    bench = workbench.open(context, budget)
+    asked = bench.plan.asked_of_source()
+
+    def read(draft):
+        from pipeline.config import hash_of
+        from pipeline.lerobot_format.quality import inspect_dataset, resolve_semantics
+        from pipeline.lerobot_format.read import content_hash, load_demonstrations, load_source, save_demonstrations
+        from pipeline.sinks import charts
+
+        dataset = bench.experiment.dataset
+        demos = load_source(dataset.source, name=bench.experiment.name, config_dir=workbench.config_dir)
+        semantics = resolve_semantics(demos, kind=dataset.kind, circular=dataset.circular)
+        check_observation_sets(bench, demos)
+        save_demonstrations(demos, draft / "frames")
+        charts.write_png(charts.demonstration_paths(demos), draft / "trajectories.png")
+        stored = content_hash(load_demonstrations(draft / "frames"))
+        meaning = [semantics.kinds, {k: list(v) for k, v in semantics.circular.items()}]
+        shortest = int(demos.lengths.min())
+        return Outcome(
+            {"asked": asked, "inspect": inspect_dataset(demos, semantics), "fingerprint": hash_of([stored, meaning])},
+            {
+                "stored_as_read": (stored == demos.content_hash, f"content hash {stored[:16]}"),
+                "counts": (
+                    shortest > 0 and int(demos.lengths.sum()) == demos.frames,
+                    f"{demos.episodes} episodes, {demos.frames:,} frames, the shortest {shortest}",
+                ),
+            },
+        )
+
+    unit = Unit("demonstrations")
+    made = bench.make(unit, read, fingerprint=lambda outcome: outcome.summary["fingerprint"])
+    facts = made.summary["inspect"]
+    metadata = {
+        "episodes": facts["episodes"],
+        "frames": facts["frames"],
+        "fps": facts["fps"],
+        "content_hash": facts["content_hash"],
+        "revision": facts["revision"],
+        "actions": table(
+            ["action", "unit", "kind", "tracking lag"],
+            zip(facts["action_names"], facts["action_units"], facts["action_kinds"], facts["tracking_lag"], strict=True),
+        ),
+        "trajectories": picture(bench.plan.folder(unit) / "trajectories.png"),
+        "warnings": dg.MetadataValue.md("\n".join(f"- {w}" for w in facts["warnings"])) if facts["warnings"] else None,
+    }
+    return result(bench, key("demonstrations"), {"": made}, present(metadata), ["stored_as_read", "counts"])
+
+
+def check_observation_sets(bench: Bench, demos) -> None:
+    """Every feature that an observation set names must be in the data.
+
+    Raises:
+        ConfigError: it is not; the message lists what there is.
+    """
+    from pipeline.errors import ConfigError, did_you_mean
+
+    for name, features in bench.experiment.dataset.observations.items():
+        for feature in features:
+            if feature not in demos.columns:
+                raise ConfigError(
+                    f"[datasets.{bench.experiment.name}.observations] {name} names '{feature}', which the data set does "
+                    f"not have. {did_you_mean(feature, demos.columns)}"
+                )
+
+
+@dg.asset(
+    partitions_def=PARTITIONS,
+    group_name=GROUP,
+    kinds={"json"},
+    deps=[demonstrations],
+    code_version=code_version("episode_split"),
+    check_specs=[
+        check_spec(key("episode_split"), "no_leakage", "No episode both trains and tests in one fold."),
+        check_spec(key("episode_split"), "held_out", "Every fold holds out at least one episode and trains on one."),
+    ],
+)
+def episode_split(
+    context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
+) -> dg.MaterializeResult:
+    """Which episodes train and which are held out. The unit is the episode: its frames are never on both sides.
+
+    Below 100 episodes there are five folds, so that every episode is held out once; from 100 on there is one.
+    """
+    bench = workbench.open(context, budget)
+
+    def split(draft):
+        from pipeline.split import make_split, save_split
+
+        e = bench.experiment
+        made = make_split(
+            bench.demonstrations,
+            protocol=e.protocol,
+            folds=e.folds,
+            test_share=e.test_share,
+            seed=e.split_seed,
+            has_simulator=e.dataset.simulator is not None,
+        )
+        save_split(made, draft / "split.json")
+        shared = sum(len(set(f.train) & set(f.test)) for f in made.folds)
+        sizes = [(len(f.train), len(f.test)) for f in made.folds]
+        return Outcome(
+            {"hash": made.hash, "sizes": sizes},
+            {
+                "no_leakage": (shared == 0, f"{shared} episodes on both sides"),
+                "held_out": (all(min(s) > 0 for s in sizes), f"{len(sizes)} fold(s), {min(s[1] for s in sizes)} held out"),
+            },
+        )
+
+    made = bench.make(Unit("episode_split"), split)
+    metadata = {
+        "folds": len(made.summary["sizes"]),
+        "hash": made.summary["hash"],
+        "episodes": table(["fold", "train", "test"], [(i, *s) for i, s in enumerate(made.summary["sizes"])]),
+    }
+    return result(bench, key("episode_split"), {"": made}, metadata, ["no_leakage", "held_out"])
+
+
+@dg.asset(
+    partitions_def=PARTITIONS,
+    group_name=GROUP,
+    kinds={"numpy"},
+    deps=[demonstrations, episode_split],
+    code_version=code_version("windows"),
+    check_specs=[
+        check_spec(key("windows"), "counts", "Every fold has windows to train on and to be scored on."),
+        check_spec(key("windows"), "finite_statistics", "The training statistics are finite, and no scale is zero."),
+    ],
+)
+def windows(
+    context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
+) -> dg.MaterializeResult:
+    """Where policies are asked: one anchor a frame, with its history before it and its targets after it.
+
+    Windows are indices, never copied frames. The statistics that normalise them come from training episodes only.
+    """
+    bench = workbench.open(context, budget)
+
+    def cut(draft):
+        from pipeline.folds import describe_windows
+
+        variants = [v for v in workbench.variants if not v.only_when_named]
+        described = describe_windows(bench.demonstrations, bench.semantics, bench.split, bench.experiment, variants)
+        (draft / "windows.json").write_text(json.dumps(described, indent=1))
+        rows = described["windows"]
+        smallest = min(min(row["train"], row["test"]) for row in rows)
+        return Outcome(
+            described,
+            {
+                "counts": (smallest > 0, f"the smallest part has {smallest:,} windows"),
+                "finite_statistics": (described["statistics_finite"], "mean and scale of every training column"),
+            },
+        )
+
+    made = bench.make(Unit("windows"), cut)
+    rows = made.summary["windows"]
+    metadata = {
+        "windows": table(
+            ["chunk", "fold", "train", "test", "memory if copied, MB"],
+            [(r["chunk"], r["fold"], r["train"], r["test"], r["copied_mb"]) for r in rows],
+        ),
+        "dead_columns": ", ".join(made.summary["dead_columns"]) or "none",
+    }
+    return result(bench, key("windows"), {"": made}, metadata, ["counts", "finite_statistics"])
+
+
+ASSETS = [demonstrations, episode_split, windows]

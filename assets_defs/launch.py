@@ -1,0 +1,142 @@
+"""Starting runs from outside the UI, so that the UI shows them and can run them again.
+
+The one file that touches Dagster's internals (`dagster._core`); a test runs it against the installed version.
+What belongs here: the instance in the results folder, creating and executing a run, closing runs that died.
+"""
+
+import os
+import socket
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import dagster as dg
+import psutil
+from dagster._core.definitions.job_base import InMemoryJob
+from dagster._core.errors import DagsterExecutionInterruptedError
+from dagster._core.execution.api import execute_run_iterator
+from dagster._core.instance.ref import InstanceRef
+from dagster._core.remote_origin import (
+    ManagedGrpcPythonEnvCodeLocationOrigin,
+    RemoteJobOrigin,
+    RemoteRepositoryOrigin,
+)
+from dagster._core.types.loadable_target_origin import LoadableTargetOrigin
+
+from assets_defs.automation import BENCHMARK
+from assets_defs.data import PARTITIONS
+from assets_defs.definitions import LOCATION
+
+MODULE = "assets_defs.definitions"
+PID_TAG, HOST_TAG = "demobench/pid", "demobench/host"
+
+INSTANCE_SETTINGS = """\
+# Written by demobench; delete it to get the defaults back.
+telemetry:
+  enabled: false
+nux:
+  enabled: false
+concurrency:
+  runs:
+    # One run a data set at a time: two would write the same folders.
+    tag_concurrency_limits:
+      - key: dagster/partition
+        limit: 1
+        value:
+          applyLimitPerUniqueValue: true
+"""
+
+
+def prepare_home(store_root: Path) -> Path:
+    """The Dagster home inside the results folder, with its settings."""
+    home = store_root / "dagster"
+    home.mkdir(parents=True, exist_ok=True)
+    settings = home / "dagster.yaml"
+    if not settings.exists():
+        settings.write_text(INSTANCE_SETTINGS, encoding="utf-8")
+    return home
+
+
+@contextmanager
+def open_instance(store_root: Path) -> Iterator[dg.DagsterInstance]:
+    """The persistent instance of a results folder."""
+    with dg.DagsterInstance.from_ref(InstanceRef.from_dir(str(prepare_home(store_root)))) as instance:
+        yield instance
+
+
+def close_dead_runs(instance: dg.DagsterInstance) -> list[str]:
+    """Runs of this machine whose process is gone are marked as failed; returns their ids."""
+    running = instance.get_runs(
+        dg.RunsFilter(
+            statuses=[dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.STARTED, dg.DagsterRunStatus.CANCELING],
+            tags={HOST_TAG: socket.gethostname()},
+        )
+    )
+    dead = [run for run in running if not psutil.pid_exists(int(run.tags.get(PID_TAG, 0)))]
+    for run in dead:
+        instance.report_run_failed(run, message=f"The process {run.tags[PID_TAG]} that made this run is gone.")
+    return [run.run_id for run in dead]
+
+
+def run_benchmark(
+    instance: dg.DagsterInstance,
+    defs: dg.Definitions,
+    partition: str,
+    assets: Sequence[dg.AssetKey],
+    observations: Sequence[str] = (),
+    on_event: Callable[[dg.DagsterEvent], None] | None = None,
+) -> dg.DagsterRun:
+    """Run the selected assets of one partition in this process; returns the finished run.
+
+    `on_event` sees every Dagster event as it happens. Ctrl-C ends the run as CANCELED and is raised again.
+    """
+    instance.add_dynamic_partitions(str(PARTITIONS.name), [partition])
+    selection = set(assets)
+    job = defs.resolve_job_def(BENCHMARK).get_subset(asset_selection=selection)
+    run_config = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
+    if observations:
+        run_config["resources"] = {"budget": {"config": {"observations": list(observations)}}}
+    run = instance.create_run_for_job(
+        job_def=job,
+        run_config=run_config,
+        asset_selection=frozenset(selection),
+        tags={
+            "dagster/partition": partition,
+            PID_TAG: str(os.getpid()),
+            HOST_TAG: socket.gethostname(),
+        },
+        remote_job_origin=_job_origin(),
+        job_code_origin=None,
+    )
+    interrupted = False
+    try:
+        for event in execute_run_iterator(InMemoryJob(job), run, instance):
+            interrupted = interrupted or _is_interrupt(event)
+            if on_event:
+                on_event(event)
+    except (KeyboardInterrupt, DagsterExecutionInterruptedError):
+        interrupted = True
+    finished = instance.get_run_by_id(run.run_id)
+    if interrupted:
+        instance.report_run_canceling(finished)
+        instance.report_run_canceled(finished)
+        raise KeyboardInterrupt
+    return finished
+
+
+def _is_interrupt(event: dg.DagsterEvent) -> bool:
+    data = event.event_specific_data
+    error = getattr(data, "error", None)
+    while error is not None:
+        if error.cls_name in ("DagsterExecutionInterruptedError", "KeyboardInterrupt"):
+            return True
+        error = error.cause
+    return False
+
+
+def _job_origin() -> RemoteJobOrigin:
+    """Where the UI finds this job: the same module and location name as in workspace.yaml."""
+    target = LoadableTargetOrigin(executable_path=sys.executable, module_name=MODULE, working_directory=os.getcwd())
+    location = ManagedGrpcPythonEnvCodeLocationOrigin(target, LOCATION)
+    return RemoteJobOrigin(RemoteRepositoryOrigin(location, "__repository__"), BENCHMARK)

@@ -1,0 +1,236 @@
+"""What would a run have to do? Fingerprints of every result, worked out in milliseconds without loading data.
+
+    fingerprint = H(code version of the asset, the settings that matter to it, the fingerprints of its inputs)
+
+A result is fresh when its `made.json` holds the fingerprint that would be computed for it now. The same plan is asked before
+a run (which assets to select), by every asset's body (whether there is work), and by the table (which results still count).
+What belongs here: which settings and inputs matter to which asset. What does not: doing the work.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import hash_of
+from pipeline.experiment import Experiment, Variant
+from pipeline.store import Store
+
+CODE_VERSIONS = {
+    "demonstrations": "1",
+    "episode_split": "1",
+    "windows": "1",
+    "multimodality_floor": "1",
+    "trained_policy": "1",
+    "predictions": "1",
+    "rollouts": "1",
+    "benchmark_table": "1",
+    "benchmark_report": "1",
+    "mcap_log": "1",
+    "rerun_recording": "1",
+}
+"""Raised by hand when what an asset computes changes: everything downstream becomes stale."""
+
+DATA = ("demonstrations", "episode_split", "windows", "multimodality_floor")
+SUMMARIES = ("benchmark_table", "benchmark_report", "mcap_log", "rerun_recording")
+POLICY = ("trained_policy", "predictions", "rollouts")
+
+FLOOR = {"radius": None, "probes": 2000, "min_neighbours": 5}
+"""The notebook's floor settings, used by the benchmark; `demobench floor` takes others. None is the estimator's default."""
+
+SIMULATOR_PACKAGES = {"pusht": ("gym-pusht", "pymunk")}
+
+
+@dataclass(frozen=True)
+class Unit:
+    """One result: an asset and, where it holds one entry an observation set, which. `mlp_k16/predictions`, `pose`."""
+
+    asset: str
+    entry: str = ""
+
+    @property
+    def kind(self) -> str:
+        return self.asset.split("/")[-1]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that can be said about one experiment's results without loading them.
+
+    variants      every policy there is; the table, the page and the recordings show those that are up to date
+    selected      the names of the policies a run was asked for; empty for all
+    observations  the observation sets it was asked for; empty for all
+    """
+
+    store: Store
+    key: str
+    experiment: Experiment
+    variants: tuple[Variant, ...]
+    selected: tuple[str, ...] = ()
+    observations: tuple[str, ...] = ()
+    _memo: dict[Unit, str | None] = field(default_factory=dict, compare=False)
+
+    @cached_property
+    def _variant_named(self) -> dict[str, Variant]:
+        return {v.name: v for v in self.variants}
+
+    def folder(self, unit: Unit) -> Path:
+        return self.store.folder(self.key, unit.asset, unit.entry)
+
+    def policy_units(self, variant: Variant, kind: str) -> list[Unit]:
+        """The entries of one asset of a policy: one an observation set, in the data set's order."""
+        return [Unit(f"{variant.name}/{kind}", s.name) for s in self.experiment.sets_of(variant)]
+
+    def selected_units(self, variant: Variant, kind: str) -> list[Unit]:
+        """Those of them that a run was asked for. A method that sees no observation set is asked for with any."""
+        units = self.policy_units(variant, kind)
+        if not self.observations or not _depends_on_set(variant):
+            return units
+        return [u for u in units if u.entry in self.observations]
+
+    def units(self) -> list[Unit]:
+        """Every result of the selection, inputs before what is made from them."""
+        variants = [v for v in self.variants if not self.selected or v.name in self.selected]
+        policies = [u for kind in POLICY for v in variants for u in self.selected_units(v, kind)]
+        return [Unit(asset) for asset in DATA] + policies + [Unit(asset) for asset in SUMMARIES]
+
+    def fingerprint(self, unit: Unit) -> str | None:
+        """What the result's fingerprint would be now; None while something it is made from is not there or stale."""
+        if unit not in self._memo:
+            self._memo[unit] = self._fingerprint(unit)
+        return self._memo[unit]
+
+    def is_fresh(self, unit: Unit) -> bool:
+        fingerprint = self.fingerprint(unit)
+        return fingerprint is not None and self.store.is_fresh(self.folder(unit), fingerprint)
+
+    def forget(self) -> None:
+        """After results were made: look at the store again."""
+        self._memo.clear()
+
+    def stale(self) -> dict[Unit, str]:
+        """Every result of the selection that must be made again, and why, in the order of the work."""
+        why: dict[Unit, str] = {}
+        for unit in self.units():
+            behind = [i for i in self._inputs(unit) if i in why]
+            if behind:
+                why[unit] = f"{_words(behind[0])} is made again"
+            elif self.store.made(self.folder(unit)) is None:
+                why[unit] = "never made"
+            elif not self.is_fresh(unit):
+                why[unit] = "its data, settings or code changed"
+        return why
+
+    def fresh_policy_units(self, kind: str) -> list[Unit]:
+        """The entries of all policies that are up to date: what the table, the page and the recordings show."""
+        return [u for v in self.variants for u in self.policy_units(v, kind) if self.is_fresh(u)]
+
+    def _fingerprint(self, unit: Unit) -> str | None:
+        if unit.kind == "demonstrations":
+            return self._demonstrations()
+        inputs = self._inputs(unit)
+        if unit.asset in SUMMARIES:
+            # A summary is made from whatever is up to date, so a policy that was never run does not hold it back.
+            inputs = [i for i in inputs if i.kind not in POLICY or self.is_fresh(i)]
+        prints = {}
+        for i in inputs:
+            if not self.is_fresh(i):
+                return None
+            prints[f"{i.asset} {i.entry}"] = self.fingerprint(i)
+        return hash_of([unit.asset, unit.entry, CODE_VERSIONS[unit.kind], self._settings(unit), prints])
+
+    def _demonstrations(self) -> str | None:
+        # Only reading can tell the content hash, so what made the last reading stale must be cheap: path, sizes, times.
+        made = self.store.made(self.folder(Unit("demonstrations")))
+        if made is None or made.summary.get("asked") != self.asked_of_source():
+            return None
+        return made.fingerprint
+
+    def asked_of_source(self) -> dict[str, Any]:
+        """What decides whether the source must be read again."""
+        from pipeline.lerobot_format.read import source_stamp
+
+        dataset = self.experiment.dataset
+        stamp = source_stamp(dataset.source, Path.cwd())
+        meaning = dataset.model_dump(mode="json", include={"kind", "circular"})
+        return {"stamp": stamp, "settings": meaning, "code": CODE_VERSIONS["demonstrations"]}
+
+    def _inputs(self, unit: Unit) -> list[Unit]:
+        data = Unit("demonstrations")
+        match unit.kind:
+            case "demonstrations":
+                return []
+            case "episode_split" | "multimodality_floor":
+                return [data]
+            case "windows":
+                return [data, Unit("episode_split")]
+            case "trained_policy":
+                # Not the `windows` asset: it covers every chunk size of the file, and a new one must not retrain the rest.
+                return [data, Unit("episode_split")]
+            case "predictions" | "rollouts":
+                return [Unit(unit.asset.replace(unit.kind, "trained_policy"), unit.entry)]
+            case "benchmark_table":
+                kinds = ("predictions", "rollouts")
+                policies = [u for kind in kinds for v in self.variants for u in self.policy_units(v, kind)]
+                return [Unit("episode_split"), Unit("multimodality_floor"), *policies]
+            case _:
+                policies = [u for v in self.variants for u in self.policy_units(v, "predictions")]
+                return [*([Unit("benchmark_table")] if unit.kind == "benchmark_report" else []), *policies]
+
+    def _settings(self, unit: Unit) -> dict[str, Any]:
+        """The settings that matter to one result, and only those."""
+        e = self.experiment
+        match unit.kind:
+            case "episode_split":
+                fields = {"protocol", "folds", "test_share", "split_seed"}
+                return _dump(e, fields) | {"has_simulator": e.dataset.simulator is not None}
+            case "windows":
+                return _dump(e, {"protocol", "history"}) | {"largest_chunk": e.largest_chunk}
+            case "multimodality_floor":
+                return {"floor": FLOOR, "observations": e.dataset.observations}
+            case "trained_policy":
+                variant = self._variant_named[unit.asset.split("/")[0]]
+                settings = {"method": variant.method, "chunk": variant.chunk, "windows": CODE_VERSIONS["windows"]}
+                settings |= _dump(e, {"protocol", "history"})
+                if _depends_on_set(variant):
+                    settings["features"] = e.dataset.observations[unit.entry]
+                if variant.is_trained:
+                    settings |= _dump(e, {"seeds", "steps", "threads", "device"})
+                return settings
+            case "predictions":
+                return {"largest_chunk": e.largest_chunk}
+            case "rollouts":
+                return {"simulator": _installed(e.dataset.simulator), "rollouts": e.rollouts}
+            case "benchmark_table":
+                return {"name": e.name, "budget": e.budget_words}
+            case _:
+                return {}
+
+
+def _depends_on_set(variant: Variant) -> bool:
+    from pipeline.policies import METHODS
+
+    return METHODS[variant.method].uses_observations
+
+
+def _installed(simulator: str | None) -> dict[str, str | None] | None:
+    """The versions that physics depends on; installing a simulator makes "not applicable" stale."""
+    if simulator is None:
+        return None
+    from importlib.metadata import PackageNotFoundError, version
+
+    found: dict[str, str | None] = {}
+    for package in SIMULATOR_PACKAGES[simulator]:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = None
+    return found
+
+
+def _dump(experiment: Experiment, fields: set[str]) -> dict[str, Any]:
+    return experiment.model_dump(mode="json", include=fields)
+
+
+def _words(unit: Unit) -> str:
+    return f"{unit.asset} ({unit.entry})" if unit.entry else unit.asset

@@ -1,0 +1,242 @@
+"""Three assets for every policy, made by a factory: its weights, its predictions on held-out episodes, its roll-outs.
+
+Baselines go the same way as trained policies. An asset of a policy holds one entry for each observation set.
+"""
+
+import shutil
+
+import dagster as dg
+
+from assets_defs.data import PARTITIONS, demonstrations, episode_split, windows
+from assets_defs.plan import Unit
+from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
+from assets_defs.show import picture, present, table
+from pipeline.experiment import Variant
+
+TRAINED = """Weights of `{name}`: {what}
+
+One entry an observation set; all seeds of all folds, as safetensors. A killed run goes on from its last checkpoint."""
+PREDICTIONS = """What `{name}` predicts at every held-out anchor, and how far that is from what was recorded.
+
+Errors are kept per episode, horizon and joint, so that every metric and interval can be made from them."""
+ROLLOUTS = """`{name}` acting in the simulator from numbered start states, the same for every policy.
+
+Where the data set has no simulator the record says so. Seed 0 of fold 0 is rolled out."""
+
+
+def policy_assets(variant: Variant) -> list[dg.AssetsDefinition]:
+    """The branch of one policy, in a group named after it."""
+    trained = _trained_policy(variant)
+    return [trained, _predictions(variant, trained), _rollouts(variant, trained)]
+
+
+def _task(bench: Bench, variant: Variant, unit: Unit):
+    from pipeline.folds import PolicyTask
+
+    sets = {s.name: s for s in bench.experiment.observation_sets}
+    return PolicyTask(
+        bench.demonstrations, bench.semantics, bench.split, sets[unit.entry], variant, bench.experiment
+    )  # fmt: skip
+
+
+def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
+    asset_key = dg.AssetKey([variant.name, "trained_policy"])
+    method = "a baseline: nothing is trained" if not variant.is_trained else f"method `{variant.method}`"
+    what = f"{method}, chunk {variant.chunk}." if variant.chunk else f"{method}."
+
+    @dg.asset(
+        key=asset_key,
+        partitions_def=PARTITIONS,
+        group_name=variant.name,
+        kinds={"pytorch", "mlflow"} if variant.is_trained else {"numpy", "mlflow"},
+        deps=[demonstrations, episode_split, windows],
+        code_version=code_version("trained_policy"),
+        description=TRAINED.format(name=variant.name, what=what),
+        check_specs=[check_spec(asset_key, "finite_losses", "Training ended with finite losses in every seed.")],
+    )
+    def trained_policy(
+        context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
+    ) -> dg.MaterializeResult:
+        bench = workbench.open(context, budget)
+        made = {}
+        for unit in bench.plan.selected_units(variant, "trained_policy"):
+            made[unit.entry] = bench.make(unit, lambda draft, unit=unit: _train(bench, variant, unit, draft))
+        rows = [(entry, m.summary["parameters"], m.summary["train_s"], m.summary["last_loss"]) for entry, m in made.items()]
+        links = {
+            f"mlflow_{entry}": dg.MetadataValue.text(m.summary["mlflow_run_id"]) for entry, m in made.items()
+        }
+        plots = {
+            f"losses_{unit.entry}": picture(bench.plan.folder(unit) / "losses.png")
+            for unit in bench.plan.selected_units(variant, "trained_policy")
+        }
+        header = ["observations", "parameters", "training seconds", "last loss"]
+        metadata = {"training": table(header, rows), **plots, **links}
+        return result(bench, asset_key, made, present(metadata), ["finite_losses"])
+
+    return trained_policy
+
+
+def _train(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
+    import numpy as np
+
+    from pipeline.folds import train_folds
+    from pipeline.sinks import charts, to_mlflow
+
+    task = _task(bench, variant, unit)
+    unfinished = bench.store.dataset(bench.plan.key) / ".unfinished" / bench.plan.fingerprint(unit)
+    name = f"{variant.name} {unit.entry}"
+    folds = train_folds(task, draft, unfinished, lambda done, total, loss: bench.progress(name, done, total, f"loss {loss:.4g}"))
+    last = float(np.mean([t.losses[:, -1].mean() for t in folds])) if variant.is_trained else None
+    if variant.is_trained:
+        charts.write_png(charts.loss_curves(folds), draft / "losses.png")
+    run_id = to_mlflow.log_training(
+        to_mlflow.tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root),
+        experiment=bench.plan.key,
+        task=task,
+        trained=folds,
+        weights=draft / "fold_0",
+        tags={"dagster_run_id": bench.run_id, "fingerprint": bench.plan.fingerprint(unit)},
+    )
+    shutil.rmtree(unfinished, ignore_errors=True)
+    return Outcome(
+        {
+            "parameters": folds[0].parameters,
+            "train_s": sum(t.train_s for t in folds),
+            "last_loss": last,
+            "mlflow_run_id": run_id,
+        },
+        {"finite_losses": (last is None or bool(np.isfinite(last)), "nothing trained" if last is None else f"{last:.4g}")},
+    )
+
+
+def _predictions(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDefinition:
+    asset_key = dg.AssetKey([variant.name, "predictions"])
+
+    @dg.asset(
+        key=asset_key,
+        partitions_def=PARTITIONS,
+        group_name=variant.name,
+        kinds={"numpy"},
+        deps=[trained],
+        code_version=code_version("predictions"),
+        description=PREDICTIONS.format(name=variant.name),
+        check_specs=[
+            check_spec(asset_key, "finite", "Every prediction is a finite number."),
+            check_spec(asset_key, "every_held_out_episode", "Every held-out episode is scored."),
+        ],
+    )
+    def predictions(
+        context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
+    ) -> dg.MaterializeResult:
+        bench = workbench.open(context, budget)
+        made = {}
+        for unit in bench.plan.selected_units(variant, "predictions"):
+            made[unit.entry] = bench.make(unit, lambda draft, unit=unit: _predict(bench, variant, unit, draft))
+        rows = [
+            (entry, m.summary["metrics"]["first_step_mae"], m.summary["metrics"]["vs_hold_still"], m.summary["latency_ms"])
+            for entry, m in made.items()
+        ]
+        plots = {
+            f"error_by_horizon_{unit.entry}": picture(bench.plan.folder(unit) / "error_by_horizon.png")
+            for unit in bench.plan.selected_units(variant, "predictions")
+        }
+        numbers = {f"first_step_mae_{row[0]}": dg.MetadataValue.float(row[1]) for row in rows if row[1] is not None}
+        header = ["observations", "first-step MAE", "× hold-still", "latency, ms"]
+        metadata = {"scores": table(header, rows), **numbers, **plots}
+        return result(bench, asset_key, made, present(metadata), ["finite", "every_held_out_episode"])
+
+    return predictions
+
+
+def _predict(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
+    import numpy as np
+
+    from pipeline.folds import predict_folds
+    from pipeline.predict import save_predictions
+    from pipeline.sinks import charts, to_mlflow
+    from pipeline.statistics.metrics import save_errors, score_task
+
+    task = _task(bench, variant, unit)
+    trained_unit = Unit(f"{variant.name}/trained_policy", unit.entry)
+    bench.progress(f"{variant.name} {unit.entry} predictions", 0, 1, "")
+    predicted, facts = predict_folds(task, bench.plan.folder(trained_unit))
+    finite = bool(np.isfinite(predicted.actions).all())
+    score = score_task(task, predicted)
+    save_predictions(predicted, draft)
+    save_errors(score.errors, draft / "errors.safetensors")
+    charts.write_png(charts.error_by_horizon_of(score.metrics, task), draft / "error_by_horizon.png")
+    to_mlflow.log_scores(
+        to_mlflow.tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root),
+        bench.summary(trained_unit)["mlflow_run_id"],
+        score.metrics,
+        score.seed_metrics,
+        artifacts=[draft / "error_by_horizon.png"],
+    )
+    held_out = {e for fold in task.split.folds for e in fold.test}
+    scored = set(score.errors.episodes.tolist())
+    return Outcome(
+        {"metrics": score.metrics, "split_hash": task.split.hash, **facts},
+        {
+            "finite": (finite, f"{predicted.actions.size:,} numbers"),
+            "every_held_out_episode": (scored == held_out, f"{len(scored)} of {len(held_out)} episodes"),
+        },
+    )
+
+
+def _rollouts(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDefinition:
+    asset_key = dg.AssetKey([variant.name, "rollouts"])
+
+    @dg.asset(
+        key=asset_key,
+        partitions_def=PARTITIONS,
+        group_name=variant.name,
+        kinds={"gymnasium"},
+        deps=[trained],
+        code_version=code_version("rollouts"),
+        description=ROLLOUTS.format(name=variant.name),
+        check_specs=[check_spec(asset_key, "sane", "Rewards lie in 0 … 1, and a success has the reward of one.")],
+    )
+    def rollouts(
+        context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
+    ) -> dg.MaterializeResult:
+        bench = workbench.open(context, budget)
+        made = {}
+        for unit in bench.plan.selected_units(variant, "rollouts"):
+            made[unit.entry] = bench.make(unit, lambda draft, unit=unit: _roll_out(bench, variant, unit, draft))
+        rows = []
+        for entry, m in made.items():
+            r = m.summary["rollouts"]
+            rows.append((entry, m.summary["why_not"], r and r["n"], r and r["success"], r and r["score"]))
+        header = ["observations", "not applicable", "start states", "success rate", "score (mean best reward)"]
+        return result(bench, asset_key, made, {"rollouts": table(header, rows)}, ["sane"])
+
+    return rollouts
+
+
+def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
+    from pipeline.errors import NotApplicableError
+    from pipeline.simulate.trial import roll_out, save_rollouts
+    from pipeline.sinks import to_mlflow
+    from pipeline.statistics.success import summarise_rollouts
+
+    trained_unit = Unit(f"{variant.name}/trained_policy", unit.entry)
+    name = f"{variant.name} {unit.entry} roll-outs"
+    try:
+        results = roll_out(
+            _task(bench, variant, unit),
+            bench.plan.folder(trained_unit),
+            lambda done, total: bench.progress(name, done, total, "frames"),
+        )
+    except NotApplicableError as why:
+        return Outcome({"rollouts": None, "why_not": str(why)}, {"sane": (True, str(why))})
+    save_rollouts(results, draft)
+    summary = summarise_rollouts(results)
+    to_mlflow.log_rollouts(
+        to_mlflow.tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root),
+        bench.summary(trained_unit)["mlflow_run_id"],
+        summary,
+    )
+    in_range = bool(((results.best_reward >= 0) & (results.best_reward <= 1)).all())
+    agree = bool((results.best_reward[results.success] >= 1).all())
+    words = f"{summary['successes']} of {summary['n']} succeeded, score {summary['score']:.3f}"
+    return Outcome({"rollouts": summary, "why_not": None}, {"sane": (in_range and agree, words)})

@@ -1,0 +1,222 @@
+"""What assets are given: the workbench (configuration and store) and the budget that the launchpad can change.
+
+A Dagster resource here is a shell around plain objects. What belongs here: opening a partition, and the one way in which an
+asset's results are made, published, checked and described. What does not: what any asset computes.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import dagster as dg
+
+from assets_defs.plan import CODE_VERSIONS, Plan, Unit
+from pipeline.config import Config, hash_of
+from pipeline.errors import ConfigError, did_you_mean
+from pipeline.experiment import Experiment, Variant, from_config, variant_key
+from pipeline.store import Made, Meter, Store
+
+Say = Callable[[str], None]
+
+
+class Budget(dg.ConfigurableResource):
+    """The few settings people change at launch. Left empty, the data set's own settings hold.
+
+    Other numbers of seeds or steps make a variant: it is stored under a key of its own and never overwrites anything.
+    """
+
+    seeds: int | None = None
+    steps: int | None = None
+    observations: list[str] = []
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What making one entry of an asset yielded.
+
+    summary   small and JSON-able; kept in made.json, so that a result that is up to date can be described without work
+    checks    check name → (passed, words)
+    """
+
+    summary: Mapping[str, Any]
+    checks: Mapping[str, tuple[bool, str]] = field(default_factory=dict)
+
+
+class Progress:
+    """How assets tell what they are doing; the terminal replaces it with bars."""
+
+    def __init__(self, say: Say):
+        self._say = say
+        self._last = time.monotonic()
+
+    def __call__(self, what: str, done: int, total: int, note: str = "") -> None:
+        if done >= total or time.monotonic() - self._last > 10:
+            self._last = time.monotonic()
+            self._say(f"{what}: {done:,} of {total:,}{', ' + note if note else ''}")
+
+
+@dataclass(frozen=True)
+class Workbench:
+    """The configuration, the store, and how to show progress. `progress` is None in the UI: the log is used."""
+
+    config: Config
+    config_dir: Path
+    store: Store
+    variants: tuple[Variant, ...]
+    progress: Callable[[str, int, int, str], None] | None = None
+    extra: Mapping[str, Experiment] = field(default_factory=dict)
+
+    def experiment(self, key: str) -> Experiment:
+        """The settings of a partition: those the command line resolved, else the file's, else as registered."""
+        if key in self.extra:
+            return self.extra[key]
+        if key in self.config.datasets:
+            return from_config(self.config, key, self.config_dir)
+        registered = self.store.experiments()
+        if key not in registered:
+            known = did_you_mean(key, [*self.config.datasets, *registered])
+            raise ConfigError(f"No data set '{key}' in the configuration or in {self.store.root}. {known}")
+        return Experiment.model_validate(registered[key])
+
+    def open(self, context: dg.AssetExecutionContext, budget: Budget) -> "Bench":
+        key = context.partition_key
+        base = self.experiment(key)
+        updates = {k: v for k, v in (("seeds", budget.seeds), ("steps", budget.steps)) if v is not None}
+        experiment = base.model_copy(update={**updates, **({"budget": None} if "steps" in updates else {})})
+        if experiment != base:
+            key = variant_key(key.split("+")[0], from_base(self, key, base), experiment)
+            self.store.register(key, experiment.model_dump(mode="json"))
+        observations = tuple(budget.observations)
+        for name in observations:
+            if name not in experiment.dataset.observations:
+                known = did_you_mean(name, experiment.dataset.observations)
+                raise ConfigError(f"'{key}' has no observation set '{name}'. {known}")
+        plan = Plan(self.store, key, experiment, self.variants, observations=observations)
+        return Bench(self, plan, self.progress or Progress(context.log.info), context.run_id)
+
+
+def from_base(workbench: Workbench, key: str, fallback: Experiment) -> Experiment:
+    """The experiment that a partition `tape+something` is a variant of."""
+    base = key.split("+")[0]
+    try:
+        return workbench.experiment(base)
+    except ConfigError:
+        return fallback
+
+
+@dataclass(frozen=True)
+class Bench:
+    """One partition, opened for one asset."""
+
+    workbench: Workbench
+    plan: Plan
+    progress: Callable[[str, int, int, str], None]
+    run_id: str
+
+    @property
+    def store(self) -> Store:
+        return self.plan.store
+
+    @property
+    def experiment(self) -> Experiment:
+        return self.plan.experiment
+
+    @cached_property
+    def demonstrations(self):
+        from pipeline.lerobot_format.read import load_demonstrations
+
+        return load_demonstrations(self.plan.folder(Unit("demonstrations")) / "frames")
+
+    @cached_property
+    def semantics(self):
+        from pipeline.lerobot_format.quality import resolve_semantics
+
+        dataset = self.experiment.dataset
+        return resolve_semantics(self.demonstrations, kind=dataset.kind, circular=dataset.circular)
+
+    @cached_property
+    def split(self):
+        from pipeline.split import load_split
+
+        return load_split(self.plan.folder(Unit("episode_split")) / "split.json")
+
+    def summary(self, unit: Unit) -> Mapping[str, Any]:
+        """What a result says about itself."""
+        made = self.store.made(self.plan.folder(unit))
+        return made.summary if made else {}
+
+    def make(self, unit: Unit, work: Callable[[Path], Outcome], fingerprint: Callable[[Outcome], str] | None = None):
+        """Make one result unless it is up to date; returns what made it.
+
+        `fingerprint` is for the one result whose fingerprint is known only after reading it (demonstrations).
+        """
+        folder = self.plan.folder(unit)
+        self.plan.forget()
+        expected = self.plan.fingerprint(unit)
+        made = self.store.made(folder)
+        if made is not None and expected is not None and made.fingerprint == expected:
+            return made
+        if expected is None and fingerprint is None:
+            missing = [i for i in self.plan._inputs(unit) if not self.plan.is_fresh(i)]
+            names = ", ".join(f"{i.asset} {i.entry}".strip() for i in missing)
+            raise ConfigError(
+                f"{unit.asset} of '{self.plan.key}' needs {names}, which is missing or out of date. Materialise it first."
+            )
+        with Meter() as meter, self.store.publish(folder) as draft:
+            outcome = work(draft)
+            summary = dict(outcome.summary)
+            summary["checks"] = {name: list(result) for name, result in outcome.checks.items()}
+            made = Made(
+                fingerprint(outcome) if fingerprint else expected,
+                round(meter.seconds, 3),
+                round(meter.peak_memory_mb, 1),
+                summary,
+            )
+            self.store.write_made(draft, made)
+        self.plan.forget()
+        return made
+
+
+
+def result(
+    bench: Bench, asset_key: dg.AssetKey, made: Mapping[str, Made], metadata: Mapping[str, Any], checks: list[str]
+) -> dg.MaterializeResult:
+    """An asset's result: its metadata, its data version, and every declared check.
+
+    `made` has one entry an observation set ("" for assets without). A check passes when it passes in every entry.
+    """
+    version = hash_of({entry: m.fingerprint for entry, m in made.items()})
+    costs = {
+        "seconds": dg.MetadataValue.float(sum(m.seconds for m in made.values())),
+        "peak_memory_mb": dg.MetadataValue.float(max((m.peak_memory_mb for m in made.values()), default=0.0)),
+        "stored_in": dg.MetadataValue.path(str(bench.store.dataset(bench.plan.key))),
+    }
+    return dg.MaterializeResult(
+        asset_key=asset_key,
+        metadata={**metadata, **costs},
+        check_results=[_check(asset_key, name, made) for name in checks],
+        data_version=dg.DataVersion(version),
+    )
+
+
+def _check(asset_key: dg.AssetKey, name: str, made: Mapping[str, Made]) -> dg.AssetCheckResult:
+    verdicts = {entry: m.summary["checks"][name] for entry, m in made.items() if name in m.summary["checks"]}
+    words = "; ".join(f"{entry}: {w}" if entry else w for entry, (_, w) in verdicts.items())
+    return dg.AssetCheckResult(
+        asset_key=asset_key,
+        check_name=name,
+        passed=all(passed for passed, _ in verdicts.values()),
+        metadata={"why": words or "nothing to check"},
+    )
+
+
+def check_spec(asset: dg.AssetKey, name: str, description: str) -> dg.AssetCheckSpec:
+    """A check that guards a number: when it fails, nothing that follows is made."""
+    return dg.AssetCheckSpec(name, asset=asset, description=description, blocking=True)
+
+
+def code_version(kind: str) -> str:
+    return CODE_VERSIONS[kind]

@@ -1,0 +1,172 @@
+"""The command line. Thin: every command reads its arguments, calls the pipeline or Dagster, and prints.
+
+Heavy modules (dagster, torch, mlflow, rerun) are imported by the commands that need them, so that `--help` is quick.
+"""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+
+from demobench import commands
+from pipeline.config import BudgetName
+from pipeline.errors import DemobenchError
+from pipeline.types import Protocol
+
+app = typer.Typer(
+    name="demobench",
+    help="How good can a policy trained on these demonstrations get, is yours there yet, and would more demonstrations help?",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+record_app = typer.Typer(help="Record demonstrations in simulation, by scripted demonstrators.", no_args_is_help=True)
+app.add_typer(record_app, name="record")
+
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="Configuration; else DEMOBENCH_CONFIG, else ./demobench.toml, else built-in.")
+]
+StoreOption = Annotated[str | None, typer.Option("--store", help="The folder for results; else the configuration's.")]
+JsonOption = Annotated[
+    str | None, typer.Option("--json", metavar="FILE|-", help="Write the numbers as JSON to a file, or to standard output.")
+]
+
+
+@app.callback()
+def _global(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+) -> None:
+    """See `main` for what --debug does."""
+
+
+@app.command(
+    epilog="""Examples:\n
+    demobench run                                   every data set of demobench.toml\n
+    demobench run my/lerobot/folder                 any LeRobot data set\n
+    demobench run hub:lerobot/pusht --seeds 3       from the Hub, three seeds\n
+    demobench run tape --policies mlp --chunks 1,16 --json results.json"""
+)
+def run(
+    datasets: Annotated[
+        list[str] | None, typer.Argument(metavar="[DATASET …]", help="Names from the file, folders, or hub:owner/name.")
+    ] = None,
+    policies: Annotated[str | None, typer.Option(help="Only these (baselines are always there): mlp,hold_still")] = None,
+    chunks: Annotated[str | None, typer.Option(help="Only these chunk sizes: 1,16")] = None,
+    observations: Annotated[str | None, typer.Option(help="Only these observation sets: position,pose")] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Training seeds.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
+    budget: Annotated[BudgetName | None, typer.Option(help="quick (600 steps), standard (3,000) or thorough (20,000).")] = None,
+    folds: Annotated[int | None, typer.Option(min=1, help="Folds of the split by episode.")] = None,
+    protocol: Annotated[Protocol | None, typer.Option(help="strict, or notebook to reproduce published numbers.")] = None,
+    device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="auto, cpu or cuda.")] = None,
+    config: ConfigOption = None,
+    store: StoreOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Run the whole benchmark: from demonstrations to a table, a page, recordings and tracked metrics."""
+    commands.run_benchmarks(
+        datasets or [],
+        choices={
+            "policies": policies, "chunks": chunks, "observations": observations, "seeds": seeds, "steps": steps,
+            "budget": budget, "folds": folds, "protocol": protocol, "device": device,
+        },
+        config_path=config,
+        store_path=store,
+        json_to=json_to,
+    )  # fmt: skip
+
+
+@app.command(epilog="Examples:\n\n    demobench inspect my/lerobot/folder\n\n    demobench inspect pusht_sim --json -")
+def inspect(
+    dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
+    config: ConfigOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """What is in a data set: counts, features, kinds of action, units, tracking lag, and what looks wrong. No training."""
+    commands.inspect_dataset(dataset, config, json_to)
+
+
+@app.command(
+    epilog="Examples:\n\n    demobench floor my/lerobot/folder\n\n"
+    "    demobench floor pusht --radius 2 --probes 2000 --min-neighbours 5"
+)
+def floor(
+    dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
+    radius: Annotated[float, typer.Option(min=1e-12, help="Frames within this distance are neighbours.")] = 2.0,
+    probes: Annotated[int, typer.Option(min=1, help="Frames, evenly spaced, whose neighbours are looked for.")] = 2000,
+    min_neighbours: Annotated[int, typer.Option(min=2, help="Probes with fewer frames around them do not count.")] = 5,
+    observations: Annotated[str | None, typer.Option(help="Only these observation sets.")] = None,
+    config: ConfigOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """How far apart are the actions people took in the same place? No deterministic policy can follow all of them."""
+    commands.measure_floor(dataset, radius, probes, min_neighbours, observations, config, json_to)
+
+
+@app.command(epilog="Examples:\n\n    demobench view pusht_sim 12\n\n    demobench view pusht_sim 12 --save episode.rrd")
+def view(
+    dataset: Annotated[str, typer.Argument(help="A data set that was benchmarked.")],
+    episode: Annotated[int, typer.Argument(help="The episode's recorded number.")],
+    policy: Annotated[str | None, typer.Option(help="Only these policies.")] = None,
+    save: Annotated[Path | None, typer.Option(help="Write a Rerun recording instead of opening the viewer.")] = None,
+    config: ConfigOption = None,
+    store: StoreOption = None,
+) -> None:
+    """Look at one episode in Rerun: what was recorded, and what every policy would have done."""
+    commands.view_episode(dataset, episode, policy, save, config, store)
+
+
+@app.command(epilog="Examples:\n\n    demobench ui\n\n    demobench ui --port 3001 --mlflow-port 5001")
+def ui(
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Dagster's port.")] = 3000,
+    mlflow_port: Annotated[int, typer.Option(min=1, max=65535, help="MLflow's port.")] = 5000,
+    config: ConfigOption = None,
+    store: StoreOption = None,
+) -> None:
+    """Dagster and MLflow in the browser, on 127.0.0.1. Ctrl-C stops both."""
+    from demobench.servers import serve
+
+    serve(port, mlflow_port, config, store)
+
+
+@record_app.command("pusht", epilog="Example:\n\n    demobench record pusht my_pusht --episodes 20 --seed 1")
+def record_pusht(
+    out: Annotated[Path, typer.Argument(help="The folder to write; it must not exist.")],
+    episodes: Annotated[int, typer.Option(min=1, help="Demonstrations to record.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same content.")] = 0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+) -> None:
+    """Record PushT demonstrations in simulation, by a planner with two strategies, as a LeRobot data set."""
+    commands.record_pusht(out, episodes, seed, workers)
+
+
+def main() -> None:
+    """Entry point: a user's mistake is one message and exit status 2; Ctrl-C is 130."""
+    # People add --debug at the end of the line that failed, wherever the option belongs.
+    debug = "--debug" in sys.argv
+    sys.argv[1:] = [word for word in sys.argv[1:] if word != "--debug"]
+    try:
+        app()
+    except DemobenchError as error:
+        if debug:
+            raise
+        Console(stderr=True, highlight=False, soft_wrap=True).print(f"[bold red]error:[/] {_escape(str(error))}")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        Console(stderr=True).print("stopped")
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(0)
+
+
+def _escape(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,311 @@
+"""What the commands do: settings → plan → Dagster run → table. `cli.py` holds their arguments, `progress.py` the bars."""
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+
+from pipeline.config import Config, find_config, load_config
+from pipeline.errors import ConfigError, StoreError, did_you_mean
+from pipeline.experiment import Choices, Target, parse_chunks, parse_list, resolve_target, select_rows
+from pipeline.store import Store, write_json
+
+
+@dataclass(frozen=True)
+class Session:
+    """A configuration, where it lies, its store, and where to print."""
+
+    config: Config
+    config_dir: Path
+    store: Store
+    console: Console
+
+
+def open_session(config_path: Path | None, store_path: str | None, json_to: str | None = None) -> Session:
+    """Read the configuration; with `--json -` everything that is not JSON goes to standard error."""
+    path = find_config(config_path)
+    config = load_config(path)
+    config_dir = path.parent if path else Path.cwd()
+    if store_path is not None:
+        config = config.model_copy(update={"store": type(config.store)(path=store_path)})
+        store = Store(Path.cwd() / Path(store_path).expanduser())
+    else:
+        store = Store(config_dir / Path(config.store.path).expanduser())
+    return Session(config, config_dir, store, Console(stderr=json_to == "-", highlight=False, soft_wrap=False))
+
+
+def write_json_to(target: str | None, value: Any) -> None:
+    """`-` is standard output; anything else a file, written whole or not at all."""
+    if target == "-":
+        sys.stdout.write(json.dumps(value, indent=1, allow_nan=False) + "\n")
+    elif target:
+        try:
+            write_json(Path(target), value)
+        except OSError as error:
+            raise StoreError(f"The JSON cannot be written to {target}: {error.strerror}.") from None
+
+
+# run ------------------------------------------------------------------------------------------------------------------
+
+
+def run_benchmarks(
+    datasets: Sequence[str],
+    *,
+    choices: Mapping[str, Any],
+    config_path: Path | None,
+    store_path: str | None,
+    json_to: str | None,
+) -> None:
+    """Benchmark every data set asked for; what is up to date is kept."""
+    session = open_session(config_path, store_path, json_to)
+    chosen = Choices(
+        **{
+            **choices,
+            "policies": parse_list(choices["policies"]),
+            "chunks": parse_chunks(choices["chunks"]),
+            "observations": parse_list(choices["observations"]),
+        }
+    )
+    names = list(dict.fromkeys(datasets)) or list(session.config.datasets)
+    if not names:
+        raise ConfigError("The configuration has no data sets. Name one: demobench run some/lerobot/folder")
+    registered = session.store.experiments()
+    targets = [resolve_target(n, session.config, session.config_dir, chosen, registered) for n in names]
+    _check_source(targets, session)
+    session.store.ensure()
+    results = [_run_one(target, session) for target in targets]
+    write_json_to(json_to, results)
+
+
+def _check_source(targets: Sequence[Target], session: Session) -> None:
+    """Fail before any work when a folder is not there."""
+    from pipeline.lerobot_format.read import source_stamp
+
+    for target in targets:
+        source_stamp(target.experiment.dataset.source, session.config_dir)
+
+
+def _run_one(target: Target, session: Session) -> dict[str, Any]:
+    from assets_defs.plan import Plan
+
+    console, store = session.console, session.store
+    plan = Plan(
+        store,
+        target.key,
+        target.experiment,
+        tuple(target.experiment.variants),
+        tuple(v.name for v in target.selected),
+        target.observations,
+    )
+    with store.lock(target.key):
+        store.register(target.key, target.experiment.model_dump(mode="json"))
+        stale = plan.stale()
+        if stale:
+            _materialise(target, session, list(stale))
+        else:
+            console.print(f"[bold]{target.key}[/] is up to date: nothing to compute.")
+    plan.forget()
+    report = _collect(target, plan, session)
+    _show(report, target, session)
+    return report
+
+
+def _materialise(target: Target, session: Session, stale: Sequence[Any]) -> None:
+    from demobench.progress import RunProgress
+
+    with RunProgress(session.console, target, stale) as progress:
+        from assets_defs.definitions import build_defs
+        from assets_defs.launch import close_dead_runs, open_instance, run_benchmark
+
+        defs = build_defs(
+            session.config,
+            config_dir=session.config_dir,
+            store=session.store,
+            progress=progress.report,
+            experiments={target.key: target.experiment},
+        )
+        import dagster as dg
+
+        assets = list(dict.fromkeys(dg.AssetKey(unit.asset.split("/")) for unit in stale))
+        with open_instance(session.store.root) as instance:
+            for run_id in close_dead_runs(instance):
+                progress.say(f"closed run {run_id[:8]}, whose process was gone")
+            try:
+                run = run_benchmark(
+                    instance, defs, target.key, assets, target.observations, on_event=progress.on_event
+                )
+            except KeyboardInterrupt:
+                progress.stop()
+                session.console.print("Stopped. What was finished is kept; the same command goes on from there.")
+                raise typer.Exit(130) from None
+    if not run.is_success:
+        progress.raise_failure(run.run_id)
+
+
+def _collect(target: Target, plan: Any, session: Session) -> dict[str, Any]:
+    """The table's JSON, less what was not asked for, with the paths of what was made."""
+    from assets_defs.plan import Unit
+
+    built = json.loads((plan.folder(Unit("benchmark_table")) / "table.json").read_text(encoding="utf-8"))
+    built["policies"] = select_rows(built["policies"], target)
+    mlflow = session.config.tracking.mlflow
+    built["artifacts"] = {
+        "report": str(plan.folder(Unit("benchmark_report")) / "report.html"),
+        "mcap": str(plan.folder(Unit("mcap_log")) / "held_out.mcap"),
+        "rerun": str(plan.folder(Unit("rerun_recording")) / "held_out.rrd"),
+        "mlflow": f"sqlite:///{session.store.root / 'mlflow.db'}" if mlflow == "sqlite" else mlflow,
+    }
+    return built
+
+
+def _show(report: Mapping[str, Any], target: Target, session: Session) -> None:
+    from pipeline.table import render_table
+
+    console = session.console
+    render_table(report, console)
+    paths = report["artifacts"]
+    opens = {
+        "report": f"xdg-open {_short(paths['report'])}",
+        "mcap": f"rerun --bind 127.0.0.1 {_short(paths['mcap'])}",
+        "rerun": f"rerun --bind 127.0.0.1 {_short(paths['rerun'])}",
+        "mlflow": "demobench ui",
+    }
+    names = {"report": "Report", "mcap": "MCAP", "rerun": "Rerun", "mlflow": "MLflow"}
+    for kind, name in names.items():
+        console.print(f"  {name:<7}{_short(paths[kind])}", soft_wrap=True)
+        console.print(f"         [dim]open with:[/] {opens[kind]}", soft_wrap=True)
+    if not target.file_has_it:
+        console.print(
+            "  [yellow]This run has policies or chunk sizes that the configuration does not define: the Dagster UI shows it "
+            "but cannot run it again.[/]"
+        )
+
+
+def _short(path: str) -> str:
+    """Relative to the working directory where that is shorter."""
+    prefix, plain = ("sqlite:///", path.removeprefix("sqlite:///")) if path.startswith("sqlite:///") else ("", path)
+    try:
+        return prefix + str(Path(plain).relative_to(Path.cwd()))
+    except ValueError:
+        return path
+
+
+# inspect, floor -------------------------------------------------------------------------------------------------------
+
+
+def _open_dataset(argument: str, session: Session) -> tuple[Target, Any, Any]:
+    """The data set of a name, folder or Hub address, and what its columns mean."""
+    from pipeline.lerobot_format.quality import resolve_semantics
+    from pipeline.lerobot_format.read import load_source
+
+    registered = session.store.experiments()
+    target = resolve_target(argument, session.config, session.config_dir, Choices(), registered)
+    dataset = target.experiment.dataset
+    demos = load_source(dataset.source, name=target.experiment.name, config_dir=session.config_dir)
+    return target, demos, resolve_semantics(demos, kind=dataset.kind, circular=dataset.circular)
+
+
+def inspect_dataset(argument: str, config_path: Path | None, json_to: str | None) -> None:
+    from demobench.show import show_inspection
+    from pipeline.lerobot_format import quality
+
+    session = open_session(config_path, None, json_to)
+    _, demos, semantics = _open_dataset(argument, session)
+    facts = quality.inspect_dataset(demos, semantics)
+    if json_to != "-":
+        show_inspection(facts, session.console)
+    write_json_to(json_to, facts)
+
+
+def measure_floor(
+    argument: str,
+    radius: float,
+    probes: int,
+    min_neighbours: int,
+    observations: str | None,
+    config_path: Path | None,
+    json_to: str | None,
+) -> None:
+    from demobench.show import show_floor
+    from pipeline.lerobot_format import quality
+    from pipeline.statistics.floors import radius_floor
+    from pipeline.table import dataset_json, floor_json
+
+    session = open_session(config_path, None, json_to)
+    target, demos, semantics = _open_dataset(argument, session)
+    sets = {s.name: s for s in target.experiment.observation_sets}
+    wanted = parse_list(observations) or tuple(sets)
+    for name in wanted:
+        if name not in sets:
+            raise ConfigError(f"The data set has no observation set '{name}'. {did_you_mean(name, sets)}")
+    floors = [
+        radius_floor(demos, semantics, sets[name], radius=radius, probes=probes, min_neighbours=min_neighbours)
+        for name in wanted
+    ]
+    facts = quality.inspect_dataset(demos, semantics)
+    if json_to != "-":
+        show_floor(floors, session.console)
+    write_json_to(json_to, {"dataset": dataset_json(facts), "floor": floor_json(floors)})
+
+
+# view, record ---------------------------------------------------------------------------------------------------------
+
+
+def view_episode(
+    argument: str,
+    episode: int,
+    policy: str | None,
+    save: Path | None,
+    config_path: Path | None,
+    store_path: str | None,
+) -> None:
+    """One episode with what every up-to-date policy predicted in it (held-out episodes have predictions)."""
+    import numpy as np
+
+    from assets_defs.plan import Plan, Unit
+    from pipeline.predict import load_predictions
+    from pipeline.sinks import to_rerun
+
+    session = open_session(config_path, store_path)
+    target, demos, semantics = _open_dataset(argument, session)
+    position = np.flatnonzero(demos.episode_ids == episode)
+    if not len(position):
+        raise ConfigError(
+            f"'{target.key}' has no episode {episode}. Its episodes are {demos.episode_ids.min()} to {demos.episode_ids.max()}."
+        )
+    plan = Plan(session.store, target.key, target.experiment, tuple(target.experiment.variants))
+    units = plan.fresh_policy_units("predictions") if plan.is_fresh(Unit("demonstrations")) else []
+    wanted = parse_list(policy)
+    names = {u.asset.split("/")[0] for u in units}
+    for name in wanted:
+        if name not in names:
+            raise ConfigError(f"No up-to-date predictions of a policy '{name}' for '{target.key}'. {did_you_mean(name, names)}")
+    predictions = [load_predictions(plan.folder(u)) for u in units if not wanted or u.asset.split("/")[0] in wanted]
+    frames = demos.episode(int(position[0]))
+    if not any(len(p.in_frames(frames)) for p in predictions):
+        session.console.print(
+            f"Episode {episode} has no predictions: it was not held out, or '{target.key}' was not benchmarked yet "
+            f"(demobench run {argument}). Showing the recording alone."
+        )
+    path = save or session.store.dataset(target.key) / "view.rrd"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    to_rerun.write_rerun(path, demos, semantics, predictions, [int(position[0])], name=f"{target.key} {episode}")
+    if save:
+        session.console.print(f"Written to {save}. Open it with: rerun --bind 127.0.0.1 {save}", soft_wrap=True)
+    else:
+        to_rerun.view(path)
+
+
+def record_pusht(out: Path, episodes: int, seed: int, workers: int) -> None:
+    from demobench.progress import counting_bar
+    from pipeline.simulate import pusht_demonstrator
+
+    console = Console(highlight=False)
+    with counting_bar(console, "demonstrations", episodes) as count:
+        pusht_demonstrator.record_pusht(out, episodes=episodes, seed=seed, workers=workers, on_episode=count)
+    console.print(f"Written to {out}. Benchmark it with: demobench run {out}", soft_wrap=True)

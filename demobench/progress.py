@@ -1,0 +1,135 @@
+"""Showing a run while it works: bars on a terminal, plain lines elsewhere, and the one message when it fails."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+from pipeline import errors
+from pipeline.errors import DemobenchError
+from pipeline.experiment import Target
+
+
+class _Rate(TextColumn):
+    """Steps a second, while there is something to count."""
+
+    def __init__(self) -> None:
+        super().__init__("")
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text(f"{speed:,.0f}/s" if speed and task.total and task.total > 1 else "", style="progress.data.speed")
+
+
+class RunProgress:
+    """Bars for one run: the assets done, and the steps of the asset at work.
+
+    While Dagster captures the output of assets, file descriptors 1 and 2 point into its logs: a duplicate of standard
+    error, taken before, still reaches the terminal.
+    """
+
+    def __init__(self, console: Console, target: Target, stale: Sequence[Any]):
+        self._target = target
+        self._assets = list(dict.fromkeys(unit.asset for unit in stale))
+        self._stream = os.fdopen(os.dup(2), "w")
+        self._console = Console(file=self._stream, highlight=False, no_color=console.no_color)
+        self._live = self._console.is_terminal
+        self._failure: str | None = None
+        self._failed_checks: list[str] = []
+        self._done = 0
+        self._bars = Progress(
+            SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), _Rate(),
+            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("[dim]{task.fields[note]}"),
+            console=self._console, transient=True, disable=not self._live,
+        )  # fmt: skip
+
+    def __enter__(self) -> "RunProgress":
+        self.say(f"[bold]{self._target.key}[/]: {len(self._assets)} assets to make, {self._target.experiment.budget_words}")
+        self._bars.start()
+        self._whole = self._bars.add_task(self._target.key, total=len(self._assets), note="")
+        self._current = self._bars.add_task("starting", total=None, note="", visible=self._live)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+        self._stream.close()
+
+    def stop(self) -> None:
+        self._bars.stop()
+
+    def say(self, line: str) -> None:
+        self._console.print(line, soft_wrap=True)
+
+    def report(self, what: str, done: int, total: int, note: str) -> None:
+        """What the asset at work says about itself; called from inside the run."""
+        self._bars.update(self._current, description=what, completed=done, total=total, note=note)
+
+    def on_event(self, event: Any) -> None:
+        """One Dagster event."""
+        kind = event.event_type_value
+        if kind == "STEP_START":
+            self._bars.reset(self._current, total=None, description=self._asset_of(event), note="")
+        elif kind == "STEP_SUCCESS":
+            self._done += 1
+            self._bars.advance(self._whole)
+            if not self._live:
+                seconds = event.event_specific_data.duration_ms / 1000
+                self.say(f"[{self._done:>2}/{len(self._assets)}] {self._asset_of(event)} {seconds:.1f} s")
+        elif kind == "ASSET_CHECK_EVALUATION" and not event.event_specific_data.passed:
+            check = event.event_specific_data
+            why = check.metadata["why"].value if "why" in check.metadata else ""
+            self._failed_checks.append(f"{check.asset_key.to_user_string()}: check '{check.check_name}' failed: {why}")
+        elif kind in ("STEP_FAILURE", "RUN_FAILURE", "PIPELINE_FAILURE") and self._failure is None:
+            self._failure = _message_of(getattr(event.event_specific_data, "error", None))
+
+    @staticmethod
+    def _asset_of(event: Any) -> str:
+        return (event.step_key or "").replace("__", "/")
+
+    def raise_failure(self, run_id: str) -> None:
+        """The run failed: raise what the user can do something about."""
+        if self._failed_checks:
+            raise DemobenchError(
+                f"{self._failed_checks[0]}. Nothing that depends on it was made; results before it are kept."
+            )
+        if self._failure is not None:
+            raise DemobenchError(self._failure)
+        raise DemobenchError(f"The run {run_id[:8]} failed for a reason that is in its log: demobench ui, Runs.")
+
+
+def _message_of(error: Any) -> str | None:
+    """The message of our own error in a chain of causes; for any other, its last cause and where the whole is."""
+    last = None
+    ours = {name for name, cls in vars(errors).items() if isinstance(cls, type) and issubclass(cls, DemobenchError)}
+    while error is not None:
+        name, _, message = error.message.strip().partition(": ")
+        if name.split(".")[-1] in ours:
+            return message
+        last, error = error, error.cause
+    if last is None:
+        return None
+    return f"{last.message.strip()} (an unexpected error; its traceback is in the run's log: demobench ui, Runs)"
+
+
+@contextmanager
+def counting_bar(console: Console, what: str, total: int) -> Iterator[Callable[[int, int], None]]:
+    """A bar for something countable; yields `update(done, total)`."""
+    with Progress(
+        SpinnerColumn(), TextColumn(what), BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("left"), TimeRemainingColumn(), console=console,
+    ) as bars:  # fmt: skip
+        task = bars.add_task(what, total=total)
+        yield lambda done, total: bars.update(task, completed=done, total=total)

@@ -1,0 +1,121 @@
+"""`demobench ui`: Dagster and MLflow as two child processes on 127.0.0.1, stopped together."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from rich.console import Console
+
+from demobench.commands import Session, open_session
+from pipeline.errors import DemobenchError
+from pipeline.sinks.to_mlflow import tracking_uri
+
+HOST = "127.0.0.1"
+
+
+def serve(port: int, mlflow_port: int, config_path: Path | None, store_path: str | None) -> None:
+    """Start both servers and wait; Ctrl-C or SIGTERM stops them.
+
+    Raises:
+        DemobenchError: a port is in use, or a server ended by itself.
+    """
+    session = open_session(config_path, store_path)
+    session.store.ensure()
+    sqlite = session.config.tracking.mlflow == "sqlite"
+    _check_free(port, "--port")
+    if sqlite:
+        _check_free(mlflow_port, "--mlflow-port")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    with tempfile.TemporaryDirectory(prefix="demobench-") as scratch:
+        processes = {"Dagster": _dagster(session, port, Path(scratch), config_path)}
+        if sqlite:
+            processes["MLflow"] = _mlflow(session, mlflow_port)
+        try:
+            _announce(session.console, port, mlflow_port if sqlite else None, session.config.tracking.mlflow)
+            _wait(processes)
+        except KeyboardInterrupt:
+            session.console.print("stopped")
+        finally:
+            _stop(list(processes.values()))
+
+
+def _check_free(port: int, option: str) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            raise DemobenchError(
+                f"Port {port} on {HOST} cannot be used: {error.strerror}. Choose another with {option}."
+            ) from None
+
+
+def _dagster(session: Session, port: int, scratch: Path, config_path: Path | None) -> subprocess.Popen:
+    from assets_defs.launch import prepare_home
+
+    workspace = scratch / "workspace.yaml"
+    workspace.write_text(
+        "load_from:\n  - python_module:\n      module_name: assets_defs.definitions\n      location_name: demobench\n"
+    )
+    environment = {
+        "DAGSTER_HOME": str(prepare_home(session.store.root)),
+        "DEMOBENCH_STORE": str(session.store.root),
+        # dagster dev still works and needs no project file; its own advice to move on is not the reader's concern.
+        "PYTHONWARNINGS": "ignore",
+    }
+    if config_path is not None:
+        environment["DEMOBENCH_CONFIG"] = str(config_path.absolute())
+    command = [sys.executable, "-m", "dagster", "dev", "-w", str(workspace), "-h", HOST, "-p", str(port)]
+    return _start(command, environment)
+
+
+def _mlflow(session: Session, port: int) -> subprocess.Popen:
+    command = [sys.executable, "-m", "mlflow", "server", "--host", HOST, "--port", str(port), "--workers", "1",
+               "--backend-store-uri", tracking_uri("sqlite", session.store.root),
+               "--default-artifact-root", (session.store.root / "mlartifacts").as_uri()]  # fmt: skip
+    return _start(command, {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false", "MLFLOW_DISABLE_TELEMETRY": "true"})
+
+
+def _start(command: list[str], environment: Mapping[str, str]) -> subprocess.Popen:
+    # A group of its own, so that stopping it reaches the server's children; the terminal's Ctrl-C comes to us alone.
+    return subprocess.Popen(
+        command,
+        env={**os.environ, **environment},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
+def _announce(console: Console, port: int, mlflow_port: int | None, mlflow: str) -> None:
+    console.print(f"Dagster  http://{HOST}:{port}   (ready in about 15 s)")
+    console.print(f"MLflow   {f'http://{HOST}:{mlflow_port}' if mlflow_port else mlflow}")
+    console.print("Ctrl-C stops both.")
+
+
+def _wait(processes: Mapping[str, subprocess.Popen]) -> None:
+    while True:
+        for name, process in processes.items():
+            if process.poll() is not None:
+                raise DemobenchError(
+                    f"{name} ended by itself with status {process.returncode}. Try its command alone to see why: "
+                    f"{' '.join(process.args)}"
+                )
+        time.sleep(0.5)
+
+
+def _stop(processes: list[subprocess.Popen]) -> None:
+    for process in processes:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGINT)
+    for process in processes:
+        try:
+            process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)

@@ -1,0 +1,66 @@
+"""Terminal output of `inspect` and `floor`. What does not belong here: computing anything."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pipeline.types import RadiusFloor
+
+
+def _number(value: float | None, digits: int = 4) -> str:
+    return "—" if value is None or value != value else f"{value:.{digits}g}"
+
+
+def show_inspection(facts: Mapping[str, Any], console: Console) -> None:
+    """The facts of `quality.inspect_dataset`."""
+    lengths = facts["lengths"]
+    console.print(f"[bold]{escape(facts['name'])}[/]  {escape(facts['source'])}", soft_wrap=True)
+    revision = f" · revision {facts['revision'][:12]}" if facts["revision"] else ""
+    console.print(
+        f"{facts['episodes']:,} episodes · {facts['frames']:,} frames · {facts['fps']:g} fps · "
+        f"{lengths['min']} to {lengths['max']} frames an episode (median {lengths['median']:g}){revision}",
+        soft_wrap=True,
+    )
+    console.print(f"content hash {facts['content_hash']}\n", soft_wrap=True)
+    features = Table("feature", "columns", "units", title="Features", title_justify="left")
+    for feature in facts["features"]:
+        units = ", ".join(dict.fromkeys(u or "?" for u in feature["units"]))
+        features.add_row(escape(feature["key"]), escape(", ".join(feature["names"])), escape(units))
+    console.print(features)
+    actions = Table("action", "kind", "unit", "tracking lag, mean |a − s|", title="Actions", title_justify="left")
+    columns = (facts["action_names"], facts["action_kinds"], facts["action_units"], facts["tracking_lag"])
+    for name, kind, unit, lag in zip(*columns, strict=True):
+        actions.add_row(escape(name), kind, unit or "?", _number(lag))
+    console.print(actions)
+    for camera in facts["cameras"]:
+        there = "there" if camera["present"] else "declared, but its files are absent"
+        console.print(f"camera {escape(camera['key'])} {camera['width']}×{camera['height']}: {there}", soft_wrap=True)
+    for warning in facts["warnings"]:
+        console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
+
+
+def show_floor(floors: Sequence[RadiusFloor], console: Console) -> None:
+    """Every floor in a row, and what the estimator is worth."""
+    table = Table("observations", "radius", "probes", "median group", "mean", "90th percentile", "unit", title_justify="left",
+                  title="Spread of the actions among frames that look alike (estimator: radius)")  # fmt: skip
+    for floor in floors:
+        if floor.refused:
+            table.add_row(escape(floor.observations), _number(floor.radius), str(floor.probes), "—", "—", "—", "")
+            continue
+        radius = _number(floor.radius) + (" deviations" if floor.scaled else "")
+        table.add_row(
+            escape(floor.observations), radius, str(floor.probes), _number(floor.median_neighbours), f"{floor.mean:.2f}",
+            f"{floor.p90:.2f}", floor.unit or "",
+        )  # fmt: skip
+    console.print(table)
+    for floor in floors:
+        if floor.refused:
+            console.print(f"[yellow]{escape(floor.observations)}:[/] {escape(floor.refused)}", soft_wrap=True)
+    console.print(
+        "This is the notebook's estimator, kept to reproduce published numbers. It is biased: a group's own mean is inside the "
+        "group, neighbours may be copies in time, only dense places count, and a wide radius adds the variation of the mean.",
+        style="dim",
+    )

@@ -1,0 +1,322 @@
+"""What is benchmarked, and how: one `Experiment` is one data set with all the settings that its numbers depend on.
+
+It is Dagster's partition, a folder of the store and the unit of comparison. What belongs here: naming experiments, expanding
+policies into variants, and command-line choices. What does not: running anything.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import (
+    BASELINES,
+    BUDGETS,
+    BudgetName,
+    Config,
+    DatasetConfig,
+    PolicyConfig,
+    Settings,
+    check_slug,
+    hash_of,
+)
+from pipeline.errors import ConfigError, did_you_mean
+from pipeline.policies import METHODS
+from pipeline.types import ObservationSet, Protocol
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One policy of a benchmark: a method with, where it has one, a chunk size. `name` is `mlp_k16` or `hold_still`."""
+
+    name: str
+    family: str
+    method: str
+    chunk: int | None
+    only_when_named: bool = False
+
+    @property
+    def is_trained(self) -> bool:
+        return METHODS[self.method].trained
+
+
+class Experiment(Settings):
+    """A data set and every setting that its numbers depend on (`device` and `threads` decide the last bits)."""
+
+    name: str
+    dataset: DatasetConfig
+    policies: dict[str, PolicyConfig]
+    protocol: Protocol
+    history: int
+    seeds: int
+    folds: int | str
+    test_share: float
+    split_seed: int
+    budget: BudgetName | None
+    steps: int
+    rollouts: int
+    threads: int
+    device: str
+
+    @property
+    def observation_sets(self) -> list[ObservationSet]:
+        return [ObservationSet(name, features) for name, features in self.dataset.observations.items()]
+
+    @property
+    def variants(self) -> list[Variant]:
+        return variants(self.policies)
+
+    @property
+    def largest_chunk(self) -> int:
+        return max((v.chunk or 1 for v in self.variants), default=1)
+
+    @property
+    def budget_words(self) -> str:
+        steps = f"{self.seeds} seed{'s' * (self.seeds != 1)} × {self.steps:,} steps"
+        return f"{self.budget} ({steps})" if self.budget else steps
+
+    def sets_of(self, variant: Variant) -> list[ObservationSet]:
+        """The observation sets a policy is asked with on this data set.
+
+        A method whose answer does not depend on the set runs once, under the first set that holds the arm's own state.
+        """
+        if not METHODS[variant.method].uses_observations:
+            with_state = [s for s in self.observation_sets if "observation.state" in s.features]
+            return (with_state or self.observation_sets)[:1]
+        wanted = self.policies[variant.family].observations
+        return [s for s in self.observation_sets if wanted == "all" or s.name in wanted]
+
+
+def variants(policies: Mapping[str, PolicyConfig]) -> list[Variant]:
+    """Expand policies into one variant a chunk size: `[policies.mlp] chunks = [1, 16]` → `mlp_k01`, `mlp_k16`.
+
+    Chunk sizes are zero-padded so that lists sorted by name are sorted by size.
+    """
+    found = []
+    for family, policy in policies.items():
+        chunk_kind = METHODS[policy.method].chunk
+        if chunk_kind != "set":
+            if policy.chunks:
+                raise ConfigError(
+                    f"[policies.{family}] has chunks, but the method '{policy.method}' takes none. Remove the line."
+                )
+            chunk = 1 if chunk_kind == "one" else None
+            found.append(Variant(family, family, policy.method, chunk, policy.only_when_named))
+            continue
+        if not policy.chunks:
+            raise ConfigError(f"[policies.{family}] needs chunk sizes, for example chunks = [1, 16].")
+        for chunk in sorted(set(policy.chunks)):
+            found.append(Variant(f"{family}_k{chunk:02d}", family, policy.method, chunk, policy.only_when_named))
+    return found
+
+
+def from_config(config: Config, name: str, config_dir: Path) -> Experiment:
+    """The experiment of a data set that the file names.
+
+    Raises:
+        ConfigError: the file has no such data set ("did you mean").
+    """
+    if name not in config.datasets:
+        raise ConfigError(
+            f"No data set '{name}': it is neither in the configuration, nor a folder, nor hub:owner/name. "
+            f"{did_you_mean(name, config.datasets)}"
+        )
+    return _experiment(config, name, config.datasets[name], config_dir)
+
+
+def _experiment(config: Config, name: str, dataset: DatasetConfig, config_dir: Path) -> Experiment:
+    benchmark = config.benchmark
+    budget = dataset.budget or benchmark.budget
+    steps = BUDGETS[budget]
+    if benchmark.steps is not None and dataset.budget is None:
+        budget, steps = None, benchmark.steps
+    return Experiment(
+        name=name,
+        dataset=dataset.model_copy(update={"source": absolute_source(dataset.source, config_dir)}),
+        policies=dict(BASELINES) | dict(config.policies),
+        protocol=benchmark.protocol,
+        history=benchmark.history,
+        seeds=benchmark.seeds,
+        folds=benchmark.folds,
+        test_share=benchmark.test_share,
+        split_seed=benchmark.split_seed,
+        budget=budget,
+        steps=steps,
+        rollouts=benchmark.rollouts,
+        threads=benchmark.threads,
+        device=benchmark.device,
+    )
+
+
+def absolute_source(source: str, config_dir: Path) -> str:
+    """A folder becomes an absolute path, so that the experiment means the same from anywhere."""
+    if source.startswith(("embedded:", "hub:")):
+        return source
+    return str((config_dir / Path(source).expanduser()).resolve())
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What the command line changed. `policies`, `chunks` and `observations` select; the rest changes the settings."""
+
+    policies: tuple[str, ...] = ()
+    chunks: tuple[int, ...] = ()
+    observations: tuple[str, ...] = ()
+    seeds: int | None = None
+    steps: int | None = None
+    budget: BudgetName | None = None
+    folds: int | None = None
+    protocol: Protocol | None = None
+    device: str | None = None
+
+
+@dataclass(frozen=True)
+class Target:
+    """An experiment, the key it is stored under, and what of it was asked for.
+
+    file_has_it   the served definitions know every policy of it, so that the UI can run it again
+    """
+
+    key: str
+    experiment: Experiment
+    selected: tuple[Variant, ...]
+    observations: tuple[str, ...]
+    file_has_it: bool
+
+
+def resolve_target(
+    argument: str, config: Config, config_dir: Path, choices: Choices, registered: Mapping[str, Mapping[str, Any]]
+) -> Target:
+    """From a word on the command line to an experiment.
+
+    Parameters
+    ----------
+    argument : a data set's name, a folder, or `hub:owner/name[@revision]`.
+    registered : `Store.experiments()`, to find a free key for a folder.
+
+    Raises
+    ------
+    ConfigError : no such data set, policy, chunk or observation set.
+    """
+    base_key, base = _base(argument, config, config_dir, registered)
+    changed = _with_choices(base, choices)
+    selected = _select(changed, choices)
+    for name in choices.observations:
+        if name not in changed.dataset.observations:
+            known = did_you_mean(name, changed.dataset.observations)
+            raise ConfigError(f"The data set '{base_key}' has no observation set '{name}'. {known}")
+    return Target(
+        key=variant_key(base_key, base, changed),
+        experiment=changed,
+        selected=tuple(selected),
+        observations=choices.observations,
+        file_has_it=set(v.name for v in changed.variants) <= set(v.name for v in base.variants),
+    )
+
+
+def _base(argument: str, config: Config, config_dir: Path, registered: Mapping[str, Any]) -> tuple[str, Experiment]:
+    if argument in config.datasets:
+        return argument, from_config(config, argument, config_dir)
+    is_path = "/" in argument or argument in (".", "..") or Path(argument).is_dir()
+    if not (argument.startswith(("hub:", "embedded:")) or is_path):
+        from_config(config, argument, config_dir)  # raises, with "did you mean"
+    source = absolute_source(argument, Path.cwd())
+    for name, dataset in config.datasets.items():
+        if absolute_source(dataset.source, config_dir) == source:
+            return name, from_config(config, name, config_dir)
+    key = _free_key(source, config, registered)
+    return key, _experiment(config, key, DatasetConfig(source=source), config_dir)
+
+
+def _free_key(source: str, config: Config, registered: Mapping[str, Any]) -> str:
+    last = re.split(r"[/:]", source.split("@")[0].rstrip("/"))[-1]
+    name = re.sub(r"\.{2,}", ".", re.sub(r"[^A-Za-z0-9_.-]", "-", last))[:60].strip("._-") or "dataset"
+    taken_by = registered.get(name, {}).get("dataset", {}).get("source")
+    if name in config.datasets or (taken_by is not None and taken_by != source):
+        name = f"{name}-{hash_of(source)[:8]}"
+    return check_slug(name, f"data set {source}")
+
+
+def _with_choices(base: Experiment, choices: Choices) -> Experiment:
+    updates: dict[str, Any] = {
+        field: value
+        for field in ("seeds", "folds", "protocol", "device")
+        if (value := getattr(choices, field)) is not None and value != getattr(base, field)
+    }
+    if choices.budget is not None:
+        updates |= {"budget": choices.budget, "steps": BUDGETS[choices.budget]}
+    if choices.steps is not None and choices.steps != base.steps:
+        named = [name for name, steps in BUDGETS.items() if steps == choices.steps]
+        updates |= {"budget": named[0] if named else None, "steps": choices.steps}
+    policies = dict(base.policies)
+    for name in choices.policies:
+        if name not in policies and name in METHODS:
+            chunks = (choices.chunks or (1, 16)) if METHODS[name].chunk == "set" else ()
+            policies[name] = PolicyConfig(method=name, chunks=chunks)
+    for family, policy in policies.items():
+        extra = set(choices.chunks) - set(policy.chunks)
+        named = not choices.policies or family in choices.policies
+        if extra and named and METHODS[policy.method].chunk == "set":
+            chunks = tuple(sorted(set(policy.chunks) | extra))
+            policies[family] = policy.model_copy(update={"chunks": chunks})
+    if policies != base.policies:
+        updates["policies"] = policies
+    return base.model_copy(update=updates)
+
+
+def _select(experiment: Experiment, choices: Choices) -> list[Variant]:
+    """The variants asked for: baselines always; of the rest those named, or all that need not be named."""
+    all_variants = experiment.variants
+    known = {v.family for v in all_variants} | {v.name for v in all_variants}
+    for name in choices.policies:
+        if name not in known:
+            raise ConfigError(f"No policy '{name}'. {did_you_mean(name, known | set(METHODS))}")
+    chosen = []
+    for variant in all_variants:
+        named = variant.family in choices.policies or variant.name in choices.policies
+        wanted = named if choices.policies else not variant.only_when_named
+        if choices.chunks and METHODS[variant.method].chunk == "set" and variant.chunk not in choices.chunks:
+            wanted = False
+        if wanted or variant.family in BASELINES:
+            chosen.append(variant)
+    return chosen
+
+
+def variant_key(base_key: str, base: Experiment, changed: Experiment) -> str:
+    """`tape`, `tape+notebook` where only the protocol differs, else `tape+<hash of all settings>`."""
+    if changed == base:
+        return base_key
+    if changed == base.model_copy(update={"protocol": changed.protocol}):
+        return f"{base_key}+{changed.protocol}"
+    return f"{base_key}+{hash_of(changed)[:8]}"
+
+
+def parse_list(text: str | None) -> tuple[str, ...]:
+    """`"a, b"` → `("a", "b")`."""
+    return tuple(part.strip() for part in (text or "").split(",") if part.strip())
+
+
+def parse_chunks(text: str | None) -> tuple[int, ...]:
+    """`"1,16"` → `(1, 16)`.
+
+    Raises:
+        ConfigError: something is not a whole number of at least 1.
+    """
+    try:
+        chunks = tuple(int(part) for part in parse_list(text))
+    except ValueError:
+        chunks = (0,)
+    if any(chunk < 1 for chunk in chunks):
+        raise ConfigError(f"--chunks takes whole numbers of at least 1, separated by commas, not '{text}'.")
+    return chunks
+
+
+def select_rows(rows: Iterable[Mapping[str, Any]], target: Target) -> list[Mapping[str, Any]]:
+    """The rows of a table that a run asked for."""
+    names = {v.name for v in target.selected}
+    return [
+        row
+        for row in rows
+        if row["policy"] in names and (not target.observations or row["observations"] in target.observations)
+    ]

@@ -1,0 +1,174 @@
+"""One policy with one observation set over every fold of a split: training, then predictions on what was held out.
+
+What belongs here: the loop over folds and where each fold's files are. What does not: how a policy learns (`train`), what
+its errors mean (`statistics`).
+"""
+
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.experiment import Experiment, Variant
+from pipeline.normalize import dead_columns
+from pipeline.policies import METHODS
+from pipeline.types import ACTION, Demonstrations, Fold, ObservationSet, Predictions, Semantics, Split
+from pipeline.windows import Windows, make_windows
+
+if TYPE_CHECKING:
+    from pipeline.train import Trained
+
+
+@dataclass(frozen=True)
+class PolicyTask:
+    """Everything that training and scoring one policy need."""
+
+    demos: Demonstrations
+    semantics: Semantics
+    split: Split
+    observation_set: ObservationSet
+    variant: Variant
+    experiment: Experiment
+
+    @property
+    def horizons(self) -> int:
+        """How many steps ahead the policy is scored: its chunk, or all that any policy here is scored on."""
+        if self.variant.chunk is not None:
+            return self.variant.chunk
+        return max(self.experiment.largest_chunk, round(self.demos.fps) + 1)
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        return tuple(range(self.experiment.seeds)) if self.variant.is_trained else (0,)
+
+    def windows(self, episodes: Iterable[int], fold: Fold) -> Windows:
+        """The anchors of some episodes, normalised by what this fold may learn from."""
+        return make_windows(
+            self.demos,
+            self.semantics,
+            self.observation_set,
+            tuple(episodes),
+            statistics_episodes=fold.train,
+            protocol=self.experiment.protocol,
+            history=self.experiment.history,
+            chunk=self.variant.chunk or 1,
+            recipe=METHODS[self.variant.method].recipe,
+        )
+
+
+def train_folds(
+    task: PolicyTask, folder: Path, unfinished: Path, on_step: Callable[[int, int, float], None] | None = None
+) -> "list[Trained]":
+    """Train on every fold; weights go to `folder/fold_0`, ….
+
+    What a killed run leaves in `unfinished` (finished folds and a checkpoint) the next one goes on from.
+    `on_step(done, total, loss)` counts the steps of all folds.
+    """
+    from pipeline.train import load_trained, save_trained, train_policy
+
+    folds = task.split.folds
+    steps = task.experiment.steps if task.variant.is_trained else 0
+    results = []
+    for number, fold in enumerate(folds):
+        kept = unfinished / f"fold_{number}"
+        if not kept.exists():
+            report = None if on_step is None else _counting_from(on_step, number * steps, len(folds))
+            trained = train_policy(
+                task.variant.method,
+                task.windows(fold.train, fold),
+                seeds=task.seeds,
+                steps=steps,
+                threads=task.experiment.threads,
+                device=task.experiment.device,
+                checkpoint=unfinished / "checkpoint.safetensors",
+                on_step=report,
+            )
+            draft = kept.with_name(f".{kept.name}")
+            save_trained(trained, draft)
+            draft.rename(kept)
+        shutil.copytree(kept, folder / kept.name)
+        results.append(load_trained(kept))
+    return results
+
+
+def _counting_from(
+    on_step: Callable[[int, int, float], None], before: int, folds: int
+) -> Callable[[int, int, float], None]:
+    return lambda done, total, loss: on_step(before + done, total * folds, loss)
+
+
+def predict_folds(task: PolicyTask, trained: Path) -> tuple[Predictions, dict[str, Any]]:
+    """Predictions at every held-out anchor, each from the fold that did not see it.
+
+    Also returns `latency_ms` of one call, and `windows_train` and `windows_test`, summed over folds.
+    """
+    from pipeline.predict import join_folds, latency_ms, predict_policy
+    from pipeline.train import load_trained
+
+    parts = []
+    facts = {"latency_ms": 0.0, "windows_train": 0, "windows_test": 0}
+    for number, fold in enumerate(task.split.folds):
+        policy = load_trained(trained / f"fold_{number}").policy
+        held_out = task.windows(fold.test, fold)
+        predicted = predict_policy(
+            policy,
+            held_out,
+            name=task.variant.name,
+            observations=task.observation_set.name,
+            fold=number,
+            seeds=task.seeds,
+            horizons=task.horizons,
+        )
+        parts.append(predicted)
+        facts["windows_train"] += len(task.windows(fold.train, fold))
+        facts["windows_test"] += len(held_out)
+        facts["latency_ms"] = facts["latency_ms"] or latency_ms(policy, held_out)
+    return join_folds(parts), facts
+
+
+def describe_windows(
+    demos: Demonstrations, semantics: Semantics, split: Split, experiment: Experiment, variants: Iterable[Variant]
+) -> dict[str, Any]:
+    """How many windows each fold has for every chunk size, and what they would weigh if they were copied (JSON-able).
+
+    `statistics_finite` and `dead_columns` are of the training statistics of all observation sets.
+    """
+    everything = ObservationSet("all", tuple(dict.fromkeys(f for s in experiment.observation_sets for f in s.features)))
+    rows: list[dict[str, Any]] = []
+    finite = True
+    seen = set()
+    for variant in variants:
+        chunk, recipe = variant.chunk or 1, METHODS[variant.method].recipe
+        if (chunk, recipe) in seen:
+            continue
+        seen.add((chunk, recipe))
+        task = PolicyTask(demos, semantics, split, everything, variant, experiment)
+        for number, fold in enumerate(split.folds):
+            train, test = task.windows(fold.train, fold), task.windows(fold.test, fold)
+            scalers = (train.normalizer.observations, train.normalizer.actions)
+            finite &= all(np.isfinite(s.mean).all() and (s.scale > 0).all() for s in scalers)
+            width = train.history * train.values.shape[1] + chunk * demos.columns[ACTION].shape[1]
+            rows.append(
+                {
+                    "chunk": chunk,
+                    "recipe": recipe,
+                    "fold": number,
+                    "train": len(train),
+                    "test": len(test),
+                    "copied_mb": round(len(train) * width * 4 / 1e6, 1),
+                    "hash": train.hash(),
+                }
+            )
+    return {"windows": rows, "statistics_finite": bool(finite), "dead_columns": _dead(demos, everything)}
+
+
+def _dead(demos: Demonstrations, observation_set: ObservationSet) -> list[str]:
+    found = []
+    for key in (*observation_set.features, ACTION):
+        feature = demos.features[key]
+        dead = dead_columns(demos.columns[key], feature.units)
+        found += [f"{key} {name}" for name, is_dead in zip(feature.names, dead, strict=True) if is_dead]
+    return found

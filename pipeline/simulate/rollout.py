@@ -1,0 +1,146 @@
+"""Rolling a policy out: many environments side by side, the policy asked once for all of them.
+
+What belongs here: the loop between policy and simulator, for any simulator. What does not: physics, success intervals.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.errors import PolicyError
+from pipeline.simulate import Environments, Simulator
+from pipeline.types import STATE, ObservationSet, Observations, Rollouts
+
+BATCH = 50
+"""Environments that a policy is asked for together. Fixed: the size of a batch changes the last bits of a matrix product,
+and contacts turn them into different episodes."""
+
+
+def rollout(
+    policy,
+    simulator: Simulator,
+    observation_set: ObservationSet,
+    start_states: Sequence[int],
+    *,
+    name: str,
+    history: int,
+    execute: int = 8,
+    max_steps: int | None = None,
+    batch: int = BATCH,
+) -> Rollouts:
+    """Ask a policy, carry out the first `execute` actions of its chunk (all where the chunk is shorter), ask again.
+
+    An environment that has succeeded stops; the others go on until `max_steps` (default: the simulator's own limit). Its row
+    stays in what the policy is asked, so every call has `batch` rows. Actions are clipped to the action space. History
+    before the first frame repeats the first frame, as in the windows a policy is trained on.
+
+    Args:
+        policy: `predict(Observations) -> [S, B, K, A]`; the first seed acts.
+        start_states: numbers of start states (`Simulator.start`).
+        name: of the policy, for the record.
+        history: frames the policy is shown.
+
+    Raises:
+        PolicyError: an answer has the wrong shape, or is not finite.
+    """
+    limit = simulator.max_steps if max_steps is None else max_steps
+    numbers = list(start_states)
+    parts = []
+    for first in range(0, len(numbers), batch):
+        block = numbers[first : first + batch]
+        padded = block + [block[-1]] * (batch - len(block))
+        episode = _Episode(simulator, observation_set, padded, history, name)
+        episode.running[len(block) :] = False
+        while episode.running.any() and episode.frame < limit:
+            chunk = episode.ask(policy)
+            for k in range(min(execute, chunk.shape[1], limit - episode.frame)):
+                if episode.running.any():
+                    episode.act(chunk[:, k])
+        parts.append({key: value[: len(block)] for key, value in episode.results().items()})
+    length = max(part["paths"].shape[1] for part in parts)
+    results = {key: np.concatenate([_lengthen(part[key], length, key) for part in parts]) for key in parts[0]}
+    return Rollouts(
+        simulator=simulator.name,
+        simulator_version=simulator.version(),
+        policy=name,
+        observations=observation_set.name,
+        start_states=np.asarray(numbers, dtype=np.int64),
+        **(results | ({} if results["paths"].shape[2] else {"paths": None})),
+    )
+
+
+class _Episode:
+    """`batch` environments from their start states to their ends, and what is remembered of them."""
+
+    def __init__(
+        self, simulator: Simulator, observation_set: ObservationSet, numbers: list[int], history: int, name: str
+    ):
+        self._simulator, self._features, self._name = simulator, observation_set.features, name
+        self._environments: Environments = simulator.start(numbers)
+        rows, columns = len(numbers), len(simulator.action_low)
+        self._seen = [self._environments.observe()] * history
+        self._previous = np.full((rows, columns), np.nan, dtype=np.float32)
+        self.running = np.ones(rows, dtype=bool)
+        self.frame = 0
+        self._success = np.zeros(rows, dtype=bool)
+        self._best_reward, self._best_coverage = np.zeros(rows), np.zeros(rows)
+        self._steps = np.zeros(rows, dtype=np.int64)
+        self._path = [self._where(self.running)]
+
+    def ask(self, policy) -> np.ndarray:
+        """[R, K, A] the policy's chunk for every environment, finished ones included."""
+        values = np.stack([np.concatenate([seen[key] for key in self._features], axis=1) for seen in self._seen], axis=1)
+        empty = np.zeros((len(values), 0), dtype=np.float32)
+        state = np.stack([seen.get(STATE, empty) for seen in self._seen], axis=1)
+        answer = np.asarray(policy.predict(Observations(values, state, self._previous.copy())))
+        rows, columns = self._previous.shape
+        if answer.ndim != 4 or answer.shape[1] != rows or answer.shape[3] != columns or 0 in answer.shape:
+            raise PolicyError(
+                f"Policy '{self._name}' answered with shape {answer.shape} in a roll-out; expected "
+                f"[seeds, {rows}, chunk, {columns}]."
+            )
+        if not np.isfinite(answer[0][self.running]).all():
+            raise PolicyError(
+                f"Policy '{self._name}' answered with NaN or infinite actions in a roll-out, at step {self.frame}. "
+                "Its training has probably diverged: look at its loss."
+            )
+        return answer[0]
+
+    def act(self, actions: np.ndarray) -> None:
+        """One frame in every environment that still runs; actions [R, A]."""
+        clipped = np.clip(actions, self._simulator.action_low, self._simulator.action_high).astype(np.float32)
+        ran = self.running.copy()
+        outcome = self._environments.step(clipped, ran)
+        self.frame += 1
+        self._previous[ran] = clipped[ran]
+        self._seen = [*self._seen[1:], self._environments.observe()]
+        self._best_reward = np.where(ran, np.maximum(self._best_reward, outcome.reward), self._best_reward)
+        self._best_coverage = np.where(ran, np.maximum(self._best_coverage, outcome.coverage), self._best_coverage)
+        self._steps += ran
+        self._success |= ran & outcome.success
+        self.running = ran & ~outcome.success
+        self._path.append(self._where(ran))
+
+    def results(self) -> dict[str, np.ndarray]:
+        return {
+            "success": self._success,
+            "best_reward": self._best_reward,
+            "best_coverage": self._best_coverage,
+            "steps": self._steps,
+            "paths": np.stack(self._path, axis=1),
+        }
+
+    def _where(self, moved: np.ndarray) -> np.ndarray:
+        """[R, 2] where the end effector is, NaN where it stood still; [R, 0] where there is nothing to draw."""
+        place = self._environments.effector()
+        if place is None:
+            return np.zeros((len(moved), 0), dtype=np.float32)
+        return np.where(moved[:, None], place, np.nan).astype(np.float32)
+
+
+def _lengthen(values: np.ndarray, length: int, key: str) -> np.ndarray:
+    """Paths of one batch padded with NaN to the longest batch; anything else as it is."""
+    if key != "paths":
+        return values
+    missing = length - values.shape[1]
+    return np.pad(values, ((0, 0), (0, missing), (0, 0)), constant_values=np.nan)

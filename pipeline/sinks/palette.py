@@ -1,0 +1,79 @@
+"""Colours and dashes: the same for a policy in every chart, on the page and in every recording.
+
+What belongs here: which colour means what, on light and on dark ground. What does not: drawing.
+
+The hues are those of Okabe & Ito (2008), told apart with any common colour blindness; each is darkened for white paper and
+lightened for dark ground. Baselines are near-grey and dashed, so that colour is left for what was trained.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Colour:
+    """One colour as `#rrggbb` on white and on dark ground."""
+
+    light: str
+    dark: str
+
+    @property
+    def rgb_on_dark(self) -> tuple[int, int, int]:
+        red, green, blue = bytes.fromhex(self.dark[1:])
+        return red, green, blue
+
+
+INK = Colour("#1c2126", "#e8eaed")
+MUTED = Colour("#59626c", "#a3abb5")
+GRID = Colour("#e4e7eb", "#30363d")
+SUCCESS = Colour("#0a7cb5", "#58b8ee")
+FAILURE = Colour("#cc5a02", "#f58b4c")
+
+TRAINED = (
+    Colour("#0072b2", "#4aa8e8"),  # blue
+    Colour("#d55e00", "#f98b45"),  # vermillion
+    Colour("#008a65", "#2fcfa0"),  # bluish green
+    Colour("#b3578f", "#e59ac8"),  # reddish purple
+    Colour("#c28500", "#f2b632"),  # orange
+    Colour("#2f93cf", "#96d6ff"),  # sky blue
+    Colour("#8f8500", "#f0e442"),  # yellow
+)
+BASELINES = {
+    "hold_still": Colour("#6b7177", "#b4bac1"),
+    "nearest_neighbour": Colour("#8a6d4b", "#c9ab87"),
+    "constant_velocity": Colour("#72789b", "#a9b0d6"),
+    "mean_action": Colour("#7d8a6a", "#b6c4a0"),
+}
+DASHES = {
+    "hold_still": (7, 4),
+    "nearest_neighbour": (2, 2),
+    "constant_velocity": (8, 3, 2, 3),
+    "mean_action": (1, 4),
+}
+SOLID = (1, 0)
+
+
+def is_baseline(policy: str) -> bool:
+    """Whether a policy is one of those that every benchmark holds for comparison; they learn no weights."""
+    return policy in BASELINES
+
+
+def policy_colours(policies: Iterable[str]) -> dict[str, Colour]:
+    """Colour of each policy, by name: equal sets of policies get equal colours whatever their order.
+
+    From the eighth trained policy on, colours come again; legends and tooltips still name each line.
+    """
+    names = sorted(set(policies))
+    trained = [name for name in names if name not in BASELINES]
+    colours = {name: TRAINED[place % len(TRAINED)] for place, name in enumerate(trained)}
+    return {name: BASELINES[name] if name in BASELINES else colours[name] for name in names}
+
+
+def dash_of(policy: str) -> tuple[int, ...]:
+    """The dash pattern of a policy's line, in pixels on and off."""
+    return DASHES.get(policy, SOLID)
+
+
+def all_colours() -> tuple[Colour, ...]:
+    """Every colour that a chart may use; no two are the same on light ground."""
+    return (INK, MUTED, GRID, SUCCESS, FAILURE, *TRAINED, *BASELINES.values())

@@ -1,0 +1,119 @@
+"""Train any method on windows, and keep what came of it in a folder.
+
+What belongs here: one call for every method, and its files: safetensors and JSON, never pickles. What does not: how a method
+learns (`policies`), or where folders lie (`store`).
+
+    weights.safetensors   all arrays of the policy; two policies are the same when these bytes are
+    policy.json           method and settings
+    training.json         losses, seconds, parameters
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import PolicyError, did_you_mean
+from pipeline.policies import METHODS, Plan
+from pipeline.windows import Windows
+
+WEIGHTS, POLICY, TRAINING = "weights.safetensors", "policy.json", "training.json"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A fitted policy and how it got there.
+
+    policy        answers `predict`, has `seeds`, `chunk`, `parameters` (see `pipeline.policies`)
+    steps_logged  [L]     losses [S, L], each the mean since the entry before; both empty for policies that do not train
+    train_s       seconds of training, all seeds together
+    """
+
+    method: str
+    policy: Any
+    steps_logged: np.ndarray
+    losses: np.ndarray
+    train_s: float
+    parameters: int
+
+
+def train_policy(
+    method: str,
+    windows: Windows,
+    *,
+    seeds: Sequence[int],
+    steps: int,
+    threads: int = 1,
+    device: str = "cpu",
+    checkpoint: Path | None = None,
+    on_step: Callable[[int, int, float], None] | None = None,
+) -> Trained:
+    """Fit a method on the windows of training episodes, all seeds together.
+
+    Parameters
+    ----------
+    checkpoint : a file. Training goes on from it where it belongs to the same windows and settings, and keeps it up to date;
+        it stays there afterwards. The weights are the same bytes as without a break.
+    on_step : called with (step, steps, mean loss of the seeds) about 200 times.
+
+    Raises
+    ------
+    PolicyError : no such method, or the loss is not finite any more.
+    """
+    if method not in METHODS:
+        raise PolicyError(f"No method '{method}'. {did_you_mean(method, METHODS)}")
+    plan = Plan(tuple(seeds), steps, threads, device, checkpoint, on_step=on_step)
+    policy, curve = METHODS[method].load_class().fit(windows, plan)
+    if curve is None:
+        return Trained(method, policy, np.empty(0, np.int64), np.empty((1, 0), np.float32), 0.0, policy.parameters)
+    return Trained(method, policy, curve.steps, curve.losses, curve.train_s, policy.parameters)
+
+
+def save_trained(trained: Trained, folder: Path) -> None:
+    """Write a trained policy into a folder, which is made if it is not there."""
+    from safetensors.numpy import save_file
+
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {name: np.ascontiguousarray(array) for name, array in trained.policy.arrays().items()}
+    save_file(arrays, folder / WEIGHTS)
+    settings = {"method": trained.method, "settings": trained.policy.settings()}
+    (folder / POLICY).write_text(json.dumps(settings, indent=1))
+    training = {
+        "steps": trained.steps_logged.tolist(),
+        "losses": trained.losses.tolist(),
+        "train_s": trained.train_s,
+        "parameters": trained.parameters,
+    }
+    (folder / TRAINING).write_text(json.dumps(training))
+
+
+def load_trained(folder: Path) -> Trained:
+    """Read what `save_trained` wrote.
+
+    Raises:
+        PolicyError: something is missing, damaged, or of a method that this version does not know.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    try:
+        described = json.loads((folder / POLICY).read_text())
+        training = json.loads((folder / TRAINING).read_text())
+        policy_class = METHODS[described["method"]].load_class()
+        policy = policy_class.restore(load_file(folder / WEIGHTS), described["settings"])
+        losses = np.array(training["losses"], np.float32)
+        steps = np.array(training["steps"], np.int64)
+        return Trained(described["method"], policy, steps, losses, training["train_s"], training["parameters"])
+    except (OSError, SafetensorError, ValueError, KeyError) as error:
+        raise PolicyError(
+            f"The trained policy in {folder} cannot be read ({type(error).__name__}: {error}). Train it again."
+        ) from None
+
+
+def weights_hash(folder: Path) -> str:
+    """sha256 over the bytes of the weights that `save_trained` wrote."""
+    return hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()

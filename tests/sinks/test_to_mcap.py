@@ -1,0 +1,137 @@
+"""MCAP files are read back by the tools that people have: the `mcap` reader with ROS 2 decoding, and rosbags."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from pipeline.errors import StoreError
+from pipeline.sinks.to_mcap import GAP_S, policy_topics, write_mcap
+from pipeline.types import ACTION, STATE
+
+from .making import make_demos, make_predictions, make_semantics
+
+POLICY = "/policy/mlp_k04/state"
+
+
+def read(path: Path) -> dict[str, list]:
+    """Topic → [(log time in ns, message)] by the `mcap` reader."""
+    found: dict[str, list] = {}
+    with path.open("rb") as file:
+        for _, channel, record, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            found.setdefault(channel.topic, []).append((record.log_time, message))
+    return found
+
+
+def test_holds_states_commands_and_first_actions(tmp_path, demos, semantics, predictions):
+    write_mcap(tmp_path / "a.mcap", demos, semantics, predictions, [1, 2], metadata={})
+    found = read(tmp_path / "a.mcap")
+
+    frames = np.arange(demos.episode_starts[1], demos.frames)
+    for topic, feature in (("/joint_states", STATE), ("/joint_commands", ACTION)):
+        np.testing.assert_array_equal([m.position for _, m in found[topic]], demos.columns[feature][frames])
+        assert all(m.name == ["x", "y"] for _, m in found[topic])
+    one = predictions[1]
+    np.testing.assert_array_equal([m.position for _, m in found[POLICY]], one.actions[0, :, 0, :])
+    assert len(found[POLICY]) == len(frames) - 2 * 2  # two frames of each episode have no history
+
+
+def test_times_are_the_demonstrations_own_clock(tmp_path, semantics):
+    demos = make_demos(lengths=(4, 3))
+    uneven = np.array([0.0, 0.05, 0.4, 0.5, 0.0, 0.11, 0.2])
+    demos = replace(demos, timestamps=uneven)
+    write_mcap(tmp_path / "a.mcap", demos, semantics, [], [1, 0], metadata={})
+
+    times = np.array([time for time, _ in read(tmp_path / "a.mcap")["/joint_states"]]) / 1e9
+    expected = np.concatenate([GAP_S + uneven[4:], GAP_S + 0.2 + GAP_S + uneven[:4]])
+    np.testing.assert_allclose(times, expected, atol=1e-9)
+
+
+def test_stamps_equal_log_times_and_predictions_sit_at_their_anchor(tmp_path, demos, semantics, predictions):
+    write_mcap(tmp_path / "a.mcap", demos, semantics, predictions, [2], metadata={})
+    found = read(tmp_path / "a.mcap")
+    for time, message in found[POLICY]:
+        assert message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec == time
+    times = [time for time, _ in found["/joint_states"]]
+    assert [time for time, _ in found[POLICY]] == times[2:]
+
+
+def test_metadata_names_data_units_kinds_and_what_the_caller_adds(tmp_path, demos, semantics, predictions):
+    write_mcap(tmp_path / "a.mcap", demos, semantics, predictions, [1], metadata={"protocol": "strict"})
+    with (tmp_path / "a.mcap").open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        described = next(record for record in reader.iter_metadata() if record.name == "demobench").metadata
+    assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
+    assert described["protocol"] == "strict"
+    assert described["dataset"] == "small"
+    assert described["content_hash"] == demos.content_hash
+    assert described["action_units"] == "px, px"
+    assert described["action_kinds"] == "position, position"
+    assert described["episodes"] == "8"
+    assert described[POLICY] == "policy mlp_k04, observations state, seed 0"
+
+
+def test_velocities_and_a_gripper_go_where_ros_expects_them(tmp_path):
+    demos = make_demos(columns=3)
+    semantics = replace(make_semantics(demos), kinds=("velocity", "velocity", "other"))
+    write_mcap(tmp_path / "a.mcap", demos, semantics, [], [0], metadata={})
+    message = read(tmp_path / "a.mcap")["/joint_commands"][0][1]
+    action = demos.columns[ACTION][0]
+    np.testing.assert_array_equal(message.velocity, [action[0], action[1], np.nan])
+    np.testing.assert_array_equal(message.position, [np.nan, np.nan, action[2]])
+
+
+def test_rosbags_reads_the_same(tmp_path, demos, semantics, predictions):
+    write_mcap(tmp_path / "a.mcap", demos, semantics, predictions, [1, 2], metadata={})
+    with AnyReader([tmp_path / "a.mcap"]) as reader:
+        counts = {c.topic: (c.msgtype, c.msgcount) for c in reader.connections}
+        connections = [c for c in reader.connections if c.topic == POLICY]
+        read_back = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(connections)]
+        texts = [
+            reader.deserialize(raw, c.msgtype).data
+            for c, _, raw in reader.messages([c for c in reader.connections if c.topic == "/episode"])
+        ]
+    assert counts["/joint_states"] == ("sensor_msgs/msg/JointState", 60)
+    np.testing.assert_array_equal([m.position for m in read_back], predictions[1].actions[0, :, 0, :])
+    assert texts == ["episode 8", "episode 9"]
+
+
+def test_predictions_for_some_episodes_only_leave_the_others_without(tmp_path, demos, semantics):
+    write_mcap(tmp_path / "a.mcap", demos, semantics, [make_predictions(demos, [2])], [0, 1, 2], metadata={})
+    found = read(tmp_path / "a.mcap")
+    assert len(found["/joint_states"]) == demos.frames
+    assert len(found[POLICY]) == 36 - 2
+
+
+def test_a_data_set_without_a_state_has_commands_only(tmp_path, demos, semantics):
+    blind = replace(demos, columns={ACTION: demos.columns[ACTION]}, features={ACTION: demos.features[ACTION]})
+    write_mcap(tmp_path / "a.mcap", blind, semantics, [], [0], metadata={})
+    assert set(read(tmp_path / "a.mcap")) == {"/episode", "/joint_commands"}
+
+
+def test_topics_are_ros_names_and_never_shared(demos):
+    names = [("act-v1.2", "pose+image"), ("act_v1_2", "pose_image"), ("1nn", "state")]
+    predictions = [replace(make_predictions(demos, [0]), policy=p, observations=o) for p, o in names]
+    assert policy_topics(predictions) == ["/policy/act_v1_2/pose_image", "/policy/act_v1_2/pose_image_", "/policy/_1nn/state"]
+
+
+def test_a_failure_leaves_the_earlier_file_and_nothing_half_written(tmp_path, demos, semantics, predictions):
+    path = tmp_path / "a.mcap"
+    write_mcap(path, demos, semantics, predictions, [1], metadata={})
+    before = path.read_bytes()
+    with pytest.raises(IndexError):
+        write_mcap(path, demos, semantics, predictions, [1, 99], metadata={})
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_cannot_be_written_is_one_clear_message(tmp_path, demos, semantics):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StoreError, match=r"a\.mcap cannot be written: .*choose another folder"):
+        write_mcap(tmp_path / "file" / "a.mcap", demos, semantics, [], [0], metadata={})

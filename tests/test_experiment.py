@@ -1,0 +1,105 @@
+"""From words on the command line to experiments and the keys they are stored under."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.config import Config, parse_config
+from pipeline.errors import ConfigError
+from pipeline.experiment import Choices, parse_chunks, resolve_target, variants
+
+CONFIG = parse_config(
+    {
+        "datasets": {"tape": {"source": "data/tape"}, "pusht_sim": {"source": "embedded:pusht_sim"}},
+        "policies": {"mlp": {"method": "mlp", "chunks": [1, 16]}},
+    },
+    "test",
+)
+HERE = Path("/somewhere")
+
+
+def target(word="tape", registered=None, **choices):
+    return resolve_target(word, CONFIG, HERE, Choices(**choices), registered or {})
+
+
+def test_a_name_of_the_file_keeps_its_name_and_resolves_its_folder():
+    found = target()
+    assert found.key == "tape"
+    assert found.experiment.dataset.source == "/somewhere/data/tape"
+    assert [v.name for v in found.selected] == [
+        "hold_still", "mean_action", "constant_velocity", "nearest_neighbour", "mlp_k01", "mlp_k16",
+    ]  # fmt: skip
+
+
+def test_the_protocol_alone_names_a_variant_in_words():
+    assert target(protocol="notebook").key == "tape+notebook"
+    assert target(protocol="strict").key == "tape"
+
+
+def test_other_settings_make_a_variant_with_a_hash():
+    two_seeds = target(seeds=2)
+    assert two_seeds.key.startswith("tape+")
+    assert two_seeds.key == target(seeds=2).key != target(seeds=3).key
+    assert two_seeds.experiment.seeds == 2
+    assert target(seeds=5).key == "tape", "the file's own number changes nothing"
+
+
+def test_a_budget_and_its_number_of_steps_are_the_same_settings():
+    assert target(steps=600).key == target(budget="quick").key
+    assert target(steps=601).experiment.budget is None
+
+
+def test_selecting_makes_no_variant_and_baselines_are_always_there():
+    found = target(policies=("mlp",), chunks=(16,))
+    assert found.key == "tape"
+    assert found.file_has_it
+    assert [v.name for v in found.selected][-1] == "mlp_k16"
+    assert {"hold_still", "nearest_neighbour"} <= {v.name for v in found.selected}
+    assert "mlp_k01" not in {v.name for v in found.selected}
+
+
+def test_a_chunk_that_the_file_lacks_makes_a_variant_the_ui_cannot_run():
+    found = target(chunks=(8,))
+    assert found.key.startswith("tape+")
+    assert not found.file_has_it
+    assert "mlp_k08" in {v.name for v in found.selected}
+
+
+def test_unknown_words_are_answered_with_the_nearest():
+    with pytest.raises(ConfigError, match="Did you mean 'tape'"):
+        target("tapes")
+    with pytest.raises(ConfigError, match="No policy 'mpl'. Did you mean 'mlp'"):
+        target(policies=("mpl",))
+    with pytest.raises(ConfigError, match="no observation set 'stat'. Did you mean 'state'"):
+        target(observations=("stat",))
+    with pytest.raises(ConfigError, match="whole numbers"):
+        parse_chunks("1,two")
+
+
+def test_a_folder_gets_its_name_and_a_hash_when_that_is_taken(tmp_path):
+    folder = tmp_path / "my data!"
+    folder.mkdir()
+    first = target(str(folder))
+    assert first.key == "my-data"
+    again = target(str(folder), registered={first.key: first.experiment.model_dump(mode="json")})
+    assert again.key == first.key
+    other = target(str(folder), registered={first.key: {"dataset": {"source": "/elsewhere"}}})
+    assert other.key.startswith("my-data-")
+    named_like_the_file = tmp_path / "tape"
+    named_like_the_file.mkdir()
+    assert target(str(named_like_the_file)).key.startswith("tape-")
+
+
+def test_hub_addresses_are_data_sets():
+    found = target("hub:lerobot/pusht@main")
+    assert found.key == "pusht"
+    assert found.experiment.dataset.source == "hub:lerobot/pusht@main"
+
+
+def test_chunks_are_zero_padded_and_wrong_chunks_refused():
+    names = [v.name for v in variants(Config().policies)]
+    assert names == ["mlp_k01", "mlp_k04", "mlp_k16", "mlp_k32", "notebook_pusht"]
+    with pytest.raises(ConfigError, match="needs chunk sizes"):
+        variants(parse_config({"policies": {"mlp": {"method": "mlp"}}}, "t").policies)
+    with pytest.raises(ConfigError, match="takes none"):
+        variants(parse_config({"policies": {"x": {"method": "hold_still", "chunks": [1]}}}, "t").policies)
