@@ -1,6 +1,8 @@
 """The benchmark: one table of policies, baselines and floors, and one page that shows it."""
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
 
 import dagster as dg
 
@@ -100,6 +102,20 @@ def _write_table(bench: Bench, draft) -> Outcome:
     )
 
 
+def project_version() -> str:
+    """This project's version, with the commit where it runs from a checkout."""
+    import subprocess
+    from importlib.metadata import version
+
+    here = Path(__file__).resolve().parents[1]
+    if not (here / ".git").exists():
+        return version("demobench")
+    asked = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=here, capture_output=True, text=True, check=False
+    )
+    return f"{version('demobench')} ({asked.stdout.strip()})" if asked.returncode == 0 else version("demobench")
+
+
 def _words(interval: Sequence[float] | None) -> str | None:
     return f"{interval[0]:.4g} … {interval[1]:.4g}" if interval else None
 
@@ -137,17 +153,31 @@ def _write_report(bench: Bench, draft) -> Outcome:
     import json
 
     from pipeline.predict import load_predictions
-    from pipeline.sinks import charts
-    from pipeline.sinks.report import outside_references, write_report
+    from pipeline.simulate.trial import load_rollouts
+    from pipeline.sinks.figures import benchmark_figures
+    from pipeline.sinks.markup import outside_references
+    from pipeline.sinks.pictures import picture_table
+    from pipeline.sinks.report import Provenance, write_report
     from pipeline.statistics.floors import load_floors
 
     plan = bench.plan
     built = json.loads((plan.folder(Unit("benchmark_table")) / "table.json").read_text())
     predictions = [load_predictions(plan.folder(u)) for u in plan.fresh_policy_units("predictions")]
     floors = load_floors(plan.folder(Unit("multimodality_floor")) / "floors.json")
+    rolled = [u for u in plan.fresh_policy_units("rollouts") if bench.summary(u)["rollouts"]]
+    figures = benchmark_figures(
+        built, bench.demonstrations, bench.semantics, predictions, floors, [load_rollouts(plan.folder(u)) for u in rolled]
+    )
+    provenance = Provenance(
+        command=bench.experiment.command,
+        history=bench.experiment.history,
+        version=project_version(),
+        made_at=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        warnings=tuple(bench.summary(Unit("demonstrations"))["inspect"]["warnings"]),
+    )
     page = draft / "report.html"
-    write_report(page, built, bench.demonstrations, bench.semantics, bench.split, predictions, floors)
-    charts.write_png(charts.error_over_horizon(built), draft / "errors.png")
+    write_report(page, built, figures, provenance)
+    picture_table(built, draft / "errors.png")
     outside = outside_references(page)
     return Outcome(
         {"size_mb": round(page.stat().st_size / 1e6, 2)},

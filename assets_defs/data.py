@@ -1,6 +1,7 @@
 """The first assets: demonstrations at a pinned revision, the split by episode, and the windows cut from it."""
 
 import json
+from pathlib import Path
 
 import dagster as dg
 
@@ -34,22 +35,23 @@ def demonstrations(
     One array a feature, episodes one after another. The content hash is the data set's identity: everything that is
     computed from it carries this hash, so two results can be compared only when it is the same.
     """
-    bench = workbench.open(context, budget)
+    bench = workbench.open(context, budget, look_at_source=True)
     asked = bench.plan.asked_of_source()
 
     def read(draft):
         from pipeline.config import hash_of
         from pipeline.lerobot_format.quality import inspect_dataset, resolve_semantics
-        from pipeline.lerobot_format.read import content_hash, load_demonstrations, load_source, save_demonstrations
-        from pipeline.sinks import charts
+        from pipeline.lerobot_format.read import load_source
+        from pipeline.lerobot_format.saved import save_demonstrations
+        from pipeline.sinks.pictures import picture_demonstration
 
         dataset = bench.experiment.dataset
         demos = load_source(dataset.source, name=bench.experiment.name, config_dir=workbench.config_dir)
         semantics = resolve_semantics(demos, kind=dataset.kind, circular=dataset.circular)
         check_observation_sets(bench, demos)
         save_demonstrations(demos, draft / "frames")
-        charts.write_png(charts.demonstration_paths(demos), draft / "trajectories.png")
-        stored = content_hash(load_demonstrations(draft / "frames"))
+        picture_demonstration(demos, semantics, draft / "trajectories.png")
+        stored = hash_again(draft / "frames")
         meaning = [semantics.kinds, {k: list(v) for k, v in semantics.circular.items()}]
         shortest = int(demos.lengths.min())
         return Outcome(
@@ -80,6 +82,15 @@ def demonstrations(
         "warnings": dg.MetadataValue.md("\n".join(f"- {w}" for w in facts["warnings"])) if facts["warnings"] else None,
     }
     return result(bench, key("demonstrations"), {"": made}, present(metadata), ["stored_as_read", "counts"])
+
+
+def hash_again(folder: Path) -> str:
+    """The content hash of demonstrations as they lie in the store."""
+    from pipeline.lerobot_format.saved import hash_demonstrations, load_demonstrations
+
+    stored = load_demonstrations(folder)
+    arrays = {name: getattr(stored, name) for name in ("episode_starts", "episode_ids", "timestamps", "tasks", "fps")}
+    return hash_demonstrations(stored.columns, stored.features, **arrays)
 
 
 def check_observation_sets(bench: Bench, demos) -> None:

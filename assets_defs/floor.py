@@ -29,16 +29,15 @@ def multimodality_floor(
     bench = workbench.open(context, budget)
 
     def measure(draft):
-        from pipeline.sinks import charts
+        from pipeline.sinks.pictures import picture_neighbourhood
         from pipeline.statistics.floors import radius_floor, save_floors
 
         sets = bench.experiment.observation_sets
         floors = [radius_floor(bench.demonstrations, bench.semantics, s, **FLOOR) for s in sets]
         save_floors(floors, draft / "floors.json")
         for floor in floors:
-            if floor.crowded is not None:
-                name = f"neighbourhood_{floor.observations}.png"
-                charts.write_png(charts.floor_scatter(bench.demonstrations, floor), draft / name)
+            name = f"neighbourhood_{floor.observations}.png"
+            picture_neighbourhood(bench.demonstrations, bench.semantics, floor, draft / name)
         rows = [
             (f.observations, f.radius, f.probes, f.median_neighbours, f.mean, f.p90, f.unit, f.refused) for f in floors
         ]

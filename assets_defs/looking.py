@@ -62,15 +62,16 @@ def _mcap_log(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
 
 
 def _write_mcap(bench: Bench, draft) -> Outcome:
-    from pipeline.sinks.to_mcap import count_messages, write_mcap
+    from pipeline.sinks.to_mcap import count_messages, expected_messages, write_mcap
 
     path = draft / "held_out.mcap"
     episodes = _held_out(bench)
-    written = write_mcap(
+    predictions = _predictions(bench)
+    write_mcap(
         path,
         bench.demonstrations,
         bench.semantics,
-        _predictions(bench),
+        predictions,
         episodes,
         metadata={
             "data_set": bench.experiment.name,
@@ -79,7 +80,7 @@ def _write_mcap(bench: Bench, draft) -> Outcome:
             "protocol": bench.experiment.protocol,
         },
     )
-    found = count_messages(path)
+    found, written = count_messages(path), expected_messages(bench.demonstrations, predictions, episodes)
     return Outcome(
         {"messages": found, "episodes": _recorded_ids(bench, episodes)},
         {"readable": (found == written, f"{found:,} of {written:,} messages")},

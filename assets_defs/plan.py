@@ -60,6 +60,8 @@ class Plan:
     variants      every policy there is; the table, the page and the recordings show those that are up to date
     selected      the names of the policies a run was asked for; empty for all
     observations  the observation sets it was asked for; empty for all
+    look_at_source  whether the source itself is looked at; inside a run what was read at its start counts, so that a
+                    revision that moves in the middle cannot mix two data sets
     """
 
     store: Store
@@ -68,6 +70,7 @@ class Plan:
     variants: tuple[Variant, ...]
     selected: tuple[str, ...] = ()
     observations: tuple[str, ...] = ()
+    look_at_source: bool = True
     _memo: dict[Unit, str | None] = field(default_factory=dict, compare=False)
 
     @cached_property
@@ -142,18 +145,21 @@ class Plan:
     def _demonstrations(self) -> str | None:
         # Only reading can tell the content hash, so what made the last reading stale must be cheap: path, sizes, times.
         made = self.store.made(self.folder(Unit("demonstrations")))
-        if made is None or made.summary.get("asked") != self.asked_of_source():
+        if made is None:
             return None
-        return made.fingerprint
+        asked = self.asked_of_source() if self.look_at_source else self._meaning()
+        recorded = made.summary.get("asked", {})
+        return made.fingerprint if all(recorded.get(name) == value for name, value in asked.items()) else None
 
     def asked_of_source(self) -> dict[str, Any]:
         """What decides whether the source must be read again."""
         from pipeline.lerobot_format.read import source_stamp
 
-        dataset = self.experiment.dataset
-        stamp = source_stamp(dataset.source, Path.cwd())
-        meaning = dataset.model_dump(mode="json", include={"kind", "circular"})
-        return {"stamp": stamp, "settings": meaning, "code": CODE_VERSIONS["demonstrations"]}
+        return {"stamp": source_stamp(self.experiment.dataset.source, Path.cwd()), **self._meaning()}
+
+    def _meaning(self) -> dict[str, Any]:
+        settings = self.experiment.dataset.model_dump(mode="json", include={"source", "kind", "circular"})
+        return {"settings": settings, "code": CODE_VERSIONS["demonstrations"]}
 
     def _inputs(self, unit: Unit) -> list[Unit]:
         data = Unit("demonstrations")

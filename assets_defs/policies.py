@@ -80,7 +80,8 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
     import numpy as np
 
     from pipeline.folds import train_folds
-    from pipeline.sinks import charts, to_mlflow
+    from pipeline.sinks import to_mlflow
+    from pipeline.sinks.pictures import picture_losses
 
     task = _task(bench, variant, unit)
     unfinished = bench.store.dataset(bench.plan.key) / ".unfinished" / bench.plan.fingerprint(unit)
@@ -88,7 +89,7 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
     folds = train_folds(task, draft, unfinished, lambda done, total, loss: bench.progress(name, done, total, f"loss {loss:.4g}"))
     last = float(np.mean([t.losses[:, -1].mean() for t in folds])) if variant.is_trained else None
     if variant.is_trained:
-        charts.write_png(charts.loss_curves(folds), draft / "losses.png")
+        picture_losses(folds[0], variant.name, draft / "losses.png")
     run_id = to_mlflow.log_training(
         to_mlflow.tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root),
         experiment=bench.plan.key,
@@ -153,7 +154,8 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
 
     from pipeline.folds import predict_folds
     from pipeline.predict import save_predictions
-    from pipeline.sinks import charts, to_mlflow
+    from pipeline.sinks import to_mlflow
+    from pipeline.sinks.pictures import picture_horizons
     from pipeline.statistics.metrics import save_errors, score_task
 
     task = _task(bench, variant, unit)
@@ -164,7 +166,7 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
     score = score_task(task, predicted)
     save_predictions(predicted, draft)
     save_errors(score.errors, draft / "errors.safetensors")
-    charts.write_png(charts.error_by_horizon_of(score.metrics, task), draft / "error_by_horizon.png")
+    picture_horizons(score.metrics, variant.name, task.demos, draft / "error_by_horizon.png")
     to_mlflow.log_scores(
         to_mlflow.tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root),
         bench.summary(trained_unit)["mlflow_run_id"],

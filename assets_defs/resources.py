@@ -81,7 +81,8 @@ class Workbench:
             raise ConfigError(f"No data set '{key}' in the configuration or in {self.store.root}. {known}")
         return Experiment.model_validate(registered[key])
 
-    def open(self, context: dg.AssetExecutionContext, budget: Budget) -> "Bench":
+    def open(self, context: dg.AssetExecutionContext, budget: Budget, look_at_source: bool = False) -> "Bench":
+        """The partition of a run, with the budget of its launch. Only the first asset looks at the source."""
         key = context.partition_key
         base = self.experiment(key)
         updates = {k: v for k, v in (("seeds", budget.seeds), ("steps", budget.steps)) if v is not None}
@@ -94,8 +95,8 @@ class Workbench:
             if name not in experiment.dataset.observations:
                 known = did_you_mean(name, experiment.dataset.observations)
                 raise ConfigError(f"'{key}' has no observation set '{name}'. {known}")
-        plan = Plan(self.store, key, experiment, self.variants, observations=observations)
-        return Bench(self, plan, self.progress or Progress(context.log.info), context.run_id)
+        plan = Plan(self.store, key, experiment, self.variants, (), observations, look_at_source)
+        return Bench(self, plan, self.progress or Progress(context.log.info), context.run.run_id)
 
 
 def from_base(workbench: Workbench, key: str, fallback: Experiment) -> Experiment:
@@ -126,7 +127,7 @@ class Bench:
 
     @cached_property
     def demonstrations(self):
-        from pipeline.lerobot_format.read import load_demonstrations
+        from pipeline.lerobot_format.saved import load_demonstrations
 
         return load_demonstrations(self.plan.folder(Unit("demonstrations")) / "frames")
 

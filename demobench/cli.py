@@ -152,6 +152,7 @@ def main() -> None:
         app()
     except DemobenchError as error:
         if debug:
+            sys.stderr.write(getattr(error, "traceback", ""))
             raise
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"[bold red]error:[/] {_escape(str(error))}")
         sys.exit(2)

@@ -47,7 +47,7 @@ class RunProgress:
         self._stream = os.fdopen(os.dup(2), "w")
         self._console = Console(file=self._stream, highlight=False, no_color=console.no_color)
         self._live = self._console.is_terminal
-        self._failure: str | None = None
+        self._failure: DemobenchError | None = None
         self._failed_checks: list[str] = []
         self._done = 0
         self._bars = Progress(
@@ -93,7 +93,7 @@ class RunProgress:
             why = check.metadata["why"].value if "why" in check.metadata else ""
             self._failed_checks.append(f"{check.asset_key.to_user_string()}: check '{check.check_name}' failed: {why}")
         elif kind in ("STEP_FAILURE", "RUN_FAILURE", "PIPELINE_FAILURE") and self._failure is None:
-            self._failure = _message_of(getattr(event.event_specific_data, "error", None))
+            self._failure = _failure_of(getattr(event.event_specific_data, "error", None))
 
     @staticmethod
     def _asset_of(event: Any) -> str:
@@ -106,22 +106,31 @@ class RunProgress:
                 f"{self._failed_checks[0]}. Nothing that depends on it was made; results before it are kept."
             )
         if self._failure is not None:
-            raise DemobenchError(self._failure)
+            raise self._failure
         raise DemobenchError(f"The run {run_id[:8]} failed for a reason that is in its log: demobench ui, Runs.")
 
 
-def _message_of(error: Any) -> str | None:
+class UnexpectedError(DemobenchError):
+    """A fault of ours inside a run. `traceback` is what Dagster kept of it; --debug shows it."""
+
+    def __init__(self, message: str, traceback: str):
+        super().__init__(message)
+        self.traceback = traceback
+
+
+def _failure_of(error: Any) -> DemobenchError | None:
     """The message of our own error in a chain of causes; for any other, its last cause and where the whole is."""
     last = None
     ours = {name for name, cls in vars(errors).items() if isinstance(cls, type) and issubclass(cls, DemobenchError)}
     while error is not None:
         name, _, message = error.message.strip().partition(": ")
         if name.split(".")[-1] in ours:
-            return message
+            return DemobenchError(message)
         last, error = error, error.cause
     if last is None:
         return None
-    return f"{last.message.strip()} (an unexpected error; its traceback is in the run's log: demobench ui, Runs)"
+    words = f"{last.message.strip()} (unexpected: a fault of demobench. --debug shows where, and so does the run's log)"
+    return UnexpectedError(words, last.to_string())
 
 
 @contextmanager

@@ -31,6 +31,8 @@ def serve(port: int, mlflow_port: int, config_path: Path | None, store_path: str
     _check_free(port, "--port")
     if sqlite:
         _check_free(mlflow_port, "--mlflow-port")
+    # Set before the servers start: a signal that a shell told us to ignore would be ignored by them too.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with tempfile.TemporaryDirectory(prefix="demobench-") as scratch:
         processes = {"Dagster": _dagster(session, port, Path(scratch), config_path)}

@@ -16,7 +16,7 @@ def _number(value: float | None, digits: int = 4) -> str:
 
 def show_inspection(facts: Mapping[str, Any], console: Console) -> None:
     """The facts of `quality.inspect_dataset`."""
-    lengths = facts["lengths"]
+    lengths = facts["episode_length"]
     console.print(f"[bold]{escape(facts['name'])}[/]  {escape(facts['source'])}", soft_wrap=True)
     revision = f" · revision {facts['revision'][:12]}" if facts["revision"] else ""
     console.print(

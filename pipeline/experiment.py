@@ -76,6 +76,15 @@ class Experiment(Settings):
         steps = f"{self.seeds} seed{'s' * (self.seeds != 1)} × {self.steps:,} steps"
         return f"{self.budget} ({steps})" if self.budget else steps
 
+    @property
+    def command(self) -> str:
+        """The command line that gives these numbers from anywhere; `--folds` only where it is a number."""
+        source = self.dataset.source
+        words = ["demobench", "run", self.name if source.startswith("embedded:") else source]
+        words += ["--protocol", self.protocol, "--seeds", str(self.seeds), "--steps", str(self.steps)]
+        words += ["--folds", str(self.folds)] if self.folds != "auto" else []
+        return " ".join(words)
+
     def sets_of(self, variant: Variant) -> list[ObservationSet]:
         """The observation sets a policy is asked with on this data set.
 

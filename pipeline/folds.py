@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.experiment import Experiment, Variant
-from pipeline.normalize import dead_columns
+from pipeline.lerobot_format.quality import dead_columns
 from pipeline.policies import METHODS
 from pipeline.types import ACTION, Demonstrations, Fold, ObservationSet, Predictions, Semantics, Split
 from pipeline.windows import Windows, make_windows
@@ -169,6 +169,6 @@ def _dead(demos: Demonstrations, observation_set: ObservationSet) -> list[str]:
     found = []
     for key in (*observation_set.features, ACTION):
         feature = demos.features[key]
-        dead = dead_columns(demos.columns[key], feature.units)
+        dead = dead_columns(demos, key)
         found += [f"{key} {name}" for name, is_dead in zip(feature.names, dead, strict=True) if is_dead]
     return found

@@ -1,10 +1,10 @@
 """From raw units to what networks and distances see, and back.
 
-What belongs here: centring, scaling, angles as sine and cosine, and what counts as a column that does not move. What does not:
-choosing episodes (`split`) or frames (`windows`).
+What belongs here: centring, scaling, angles as sine and cosine. What does not: choosing episodes (`split`) or frames
+(`windows`), and which columns are angles or do not move (`lerobot_format.quality`).
 
-A block of D columns is encoded as D + C columns, C of them circular: first the D columns in order, an angle replaced by its
-sine, then the cosines of the angles.
+A block of D columns is encoded as D + C columns, C of them circular: first the D columns in order, an angle replaced by
+its sine, then the cosines of the angles.
 """
 
 import hashlib
@@ -14,16 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import NotApplicableError
-from pipeline.lerobot_format.units import usual_range
+from pipeline.lerobot_format.kinds import wrap
+from pipeline.lerobot_format.quality import dead_columns
 from pipeline.types import ACTION, STATE, Demonstrations, Protocol, Semantics
 
-DEAD_SHARE = 1e-3
-"""A column whose deviation is below this share of its unit's usual range does not move."""
-
-ROUNDING = 1e-6
-"""Where no usual range is known: a deviation below this share of the largest value is float32 rounding."""
-
 NOTEBOOK_SMALLEST = 1e-6
+"""The notebook divides by the deviation, or by this where a column does not move."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +94,6 @@ class Normalizer:
         return cls(Scaler.from_arrays(arrays, "observations"), Scaler.from_arrays(arrays, "actions"))
 
 
-def wrap(angle: np.ndarray) -> np.ndarray:
-    """Angles to [−π, π), radians."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
 def unroll(values: np.ndarray, circular: np.ndarray) -> np.ndarray:
     """[..., D] → [..., D + C] float64: angles as sine in their place and cosine at the end."""
     values = np.asarray(values, np.float64)
@@ -114,33 +105,25 @@ def unroll(values: np.ndarray, circular: np.ndarray) -> np.ndarray:
     return out
 
 
-def dead_columns(values: np.ndarray, units: Sequence[str | None]) -> np.ndarray:
-    """[D] bool: the columns of `values` [n, D] that do not move, judged by the usual range of their unit."""
-    deviation = values.std(axis=0, dtype=np.float64)
-    largest = np.abs(values).max(axis=0, initial=0.0)
-    usual = np.array([usual_range(unit) or np.nan for unit in units], np.float64)
-    threshold = np.where(np.isnan(usual), ROUNDING * largest, DEAD_SHARE * usual)
-    return deviation <= threshold
+def fit_scaler(values: np.ndarray, circular: np.ndarray, dead: np.ndarray) -> Scaler:
+    """Means and deviations of `values` [n, D]; columns that are `dead` [D] keep the scale 1.
 
-
-def fit_scaler(values: np.ndarray, circular: np.ndarray, units: Sequence[str | None], protocol: Protocol) -> Scaler:
-    """Means and deviations of `values` [n, D].
-
-    The sine and cosine of an angle share one scale, so that distances on the circle stay distances. `notebook` knows no
-    circles and no dead columns: it divides by the deviation, at least 1e-6.
+    The sine and cosine of an angle share one scale, so that distances on the circle stay distances.
     """
-    if protocol == "notebook":
-        mean, deviation = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
-        nothing = np.zeros(values.shape[1], bool)
-        return Scaler(nothing, np.zeros(values.shape[1]), mean, np.maximum(deviation, NOTEBOOK_SMALLEST))
     columns = unroll(values, circular)
     mean, scale = columns.mean(axis=0), columns.std(axis=0)
-    dead = dead_columns(values, units)
-    of_circle, cosines = np.flatnonzero(circular), np.arange(values.shape[1], columns.shape[1])
-    scale[of_circle] = scale[cosines] = np.sqrt((scale[of_circle] ** 2 + scale[cosines] ** 2) / 2)
-    dead = np.concatenate([dead, dead[of_circle]])
+    sines, cosines = np.flatnonzero(circular), np.arange(values.shape[1], columns.shape[1])
+    scale[sines] = scale[cosines] = np.sqrt((scale[sines] ** 2 + scale[cosines] ** 2) / 2)
+    still = np.concatenate([dead, dead[sines]]) | (scale == 0)
     centre = np.where(circular, (values.min(axis=0) + values.max(axis=0)) / 2.0, 0.0)
-    return Scaler(circular, centre, mean, np.where(dead, 1.0, scale))
+    return Scaler(circular, centre, mean, np.where(still, 1.0, scale))
+
+
+def fit_notebook_scaler(values: np.ndarray) -> Scaler:
+    """As the notebook scales `values` [n, D]: it knows neither circles nor columns that do not move."""
+    mean, deviation = values.mean(axis=0, dtype=np.float64), values.std(axis=0, dtype=np.float64)
+    nothing = np.zeros(values.shape[1])
+    return Scaler(nothing.astype(bool), nothing, mean, np.maximum(deviation, NOTEBOOK_SMALLEST))
 
 
 def fit_normalizer(
@@ -162,16 +145,29 @@ def fit_normalizer(
     ------
     NotApplicableError : `state_for_actions`, and an action column commands no state column.
     """
-    frames = np.concatenate([np.arange(demos.frames)[demos.episode(e)] for e in episodes])
-    values = np.concatenate([demos.columns[key][frames] for key in features], axis=1)
-    circular = np.concatenate([np.asarray(semantics.circular.get(key, (False,) * demos.columns[key].shape[1]), bool) for key in features])
-    units = [unit for key in features for unit in demos.features[key].units]
-    observations = fit_scaler(values, circular, units, protocol)
-    key, actions = ACTION, demos.columns[ACTION]
-    if state_for_actions:
-        key, actions = STATE, demos.columns[STATE][:, commanded_columns(demos, semantics)]
-    action_circular = np.asarray(semantics.circular.get(ACTION, (False,) * actions.shape[1]), bool)
-    return Normalizer(observations, fit_scaler(actions[frames], action_circular, demos.features[ACTION].units, protocol))
+    frames = frames_of(demos, episodes)
+    seen = np.concatenate([demos.columns[key][frames] for key in features], axis=1)
+    actions = demos.columns[ACTION][frames]
+    if protocol == "notebook":
+        if state_for_actions:
+            actions = demos.columns[STATE][frames][:, commanded_columns(demos, semantics)]
+        return Normalizer(fit_notebook_scaler(seen), fit_notebook_scaler(actions))
+    dead = np.concatenate([dead_columns(demos, key, frames) for key in features])
+    return Normalizer(
+        fit_scaler(seen, circular_columns(demos, semantics, features), dead),
+        fit_scaler(actions, circular_columns(demos, semantics, [ACTION]), dead_columns(demos, ACTION, frames)),
+    )
+
+
+def frames_of(demos: Demonstrations, episodes: Sequence[int]) -> np.ndarray:
+    """The global frames of some episodes, one episode after another."""
+    return np.concatenate([np.arange(demos.frames)[demos.episode(episode)] for episode in episodes])
+
+
+def circular_columns(demos: Demonstrations, semantics: Semantics, features: Sequence[str]) -> np.ndarray:
+    """[D] bool: which columns of these features, side by side, are angles that wrap."""
+    nowhere = {key: (False,) * demos.columns[key].shape[1] for key in features}
+    return np.concatenate([np.array(semantics.circular.get(key, nowhere[key]), bool) for key in features])
 
 
 def commanded_columns(demos: Demonstrations, semantics: Semantics) -> list[int]:

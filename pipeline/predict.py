@@ -12,11 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.types import Predictions
+from pipeline.errors import StoreError
+from pipeline.types import ACTION, Predictions
 from pipeline.windows import Windows
 
 BLOCK = 2048
 """Anchors asked at a time."""
+
+ARRAYS = ("anchors", "fold", "actions")
+"""The arrays of `Predictions`, a file each."""
 
 
 def predict_policy(
@@ -38,7 +42,7 @@ def predict_policy(
     horizons : how many actions a policy without a chunk is asked for.
     """
     chunk = policy.chunk or horizons
-    columns = windows.demos.columns["action"].shape[1]
+    columns = windows.demos.columns[ACTION].shape[1]
     kept = _positions(policy, seeds)
     actions = np.empty((len(kept), len(windows), chunk, columns), np.float32)
     for start in range(0, len(windows), BLOCK):
@@ -102,12 +106,17 @@ def latency_ms(policy: Any, windows: Windows, calls: int = 50) -> float:
 
 
 def temporal_ensemble(
-    actions: np.ndarray, anchors: np.ndarray, episode_starts: np.ndarray, *, circular: np.ndarray | None = None, m: float = 0.01
+    actions: np.ndarray,
+    anchors: np.ndarray,
+    episode_starts: np.ndarray,
+    *,
+    circular: np.ndarray | None = None,
+    m: float = 0.01,
 ) -> np.ndarray:
     """Average, at every anchor, all that was predicted for its frame there and before (ACT, Zhao et al. 2023).
 
-    Weights are exp(−m · i), i = 0 for the oldest prediction, as in ACT's own code. A policy that runs this way is asked at every frame;
-    predictions of another episode never enter.
+    Weights are exp(−m · i), i = 0 for the oldest prediction, as in ACT's own code. A policy that runs this way is asked
+    at every frame; predictions of another episode never enter.
 
     Parameters
     ----------
@@ -139,19 +148,3 @@ def temporal_ensemble(
         total += weight
         older += use
     return np.where(circular, np.arctan2(sine, cosine), sine / total[:, None]).astype(np.float32)
-
-
-def save_predictions(predictions: Predictions, folder: Path) -> None:
-    """Write predictions as .npy files, which can be read without loading them whole."""
-    np.save(folder / "actions.npy", predictions.actions)
-    np.save(folder / "anchors.npy", np.stack([predictions.anchors, predictions.fold]))
-    about = {"policy": predictions.policy, "observations": predictions.observations, "seeds": predictions.seeds}
-    (folder / "predictions.json").write_text(json.dumps(about), encoding="utf-8")
-
-
-def load_predictions(folder: Path) -> Predictions:
-    """The inverse of `save_predictions`; `actions` is a memory map."""
-    about = json.loads((folder / "predictions.json").read_text(encoding="utf-8"))
-    anchors, fold = np.load(folder / "anchors.npy", allow_pickle=False)
-    actions = np.load(folder / "actions.npy", mmap_mode="r", allow_pickle=False)
-    return Predictions(about["policy"], about["observations"], tuple(about["seeds"]), anchors, fold, actions)

@@ -1,7 +1,7 @@
 """Which episodes train and which are held out. The unit is the episode: its frames are never on both sides.
 
-What belongs here: drawing folds, and naming them by a hash. What does not: windows, statistics, anything that looks at a value.
-Episodes are drawn from their number alone, so a split cannot depend on what was recorded.
+What belongs here: drawing folds, and naming them by a hash. What does not: windows, statistics, anything that looks at
+a value. Episodes are drawn from their number alone, so a split cannot depend on what was recorded.
 """
 
 import hashlib
@@ -34,9 +34,9 @@ def make_split(
 
     Parameters
     ----------
-    protocol : `notebook` has one fold, the first `int(0.8 · E)` episodes train; `folds`, `test_share` and `seed` are not used.
-    folds : how many; `"auto"` is one from 100 episodes on and where there is a simulator, else five (fewer where there are
-        fewer episodes).
+    protocol : `notebook` has one fold, the first `int(0.8 · E)` episodes train; what follows is not used.
+    folds : how many; `"auto"` is one from 100 episodes on and where there is a simulator, else five (fewer where
+        there are fewer episodes).
     test_share : the share of episodes held out when there is one fold; at least one episode on each side.
 
     Raises
@@ -47,8 +47,8 @@ def make_split(
     episodes = demos.episodes
     if episodes < 2:
         raise NotApplicableError(
-            f"The data set '{demos.name}' has {episodes} episode{'s' * (episodes != 1)}. A benchmark needs at least two: one "
-            "to train on and one to hold out. Record more demonstrations."
+            f"The data set '{demos.name}' has {episodes} episode{'s' * (episodes != 1)}. A benchmark needs two: "
+            "one to train on and one to hold out. Record more demonstrations."
         )
     if protocol == "notebook":
         boundary = max(1, int(NOTEBOOK_SHARE * episodes))
@@ -64,8 +64,8 @@ def _fold_count(demos: Demonstrations, folds: int | Literal["auto"], has_simulat
         return 1 if has_simulator or demos.episodes >= SMALL else min(AUTO_FOLDS, demos.episodes)
     if folds > demos.episodes:
         raise ConfigError(
-            f"folds = {folds}, but the data set '{demos.name}' has {demos.episodes} episodes, and every fold must hold out "
-            f"at least one. Ask for at most {demos.episodes} folds."
+            f"folds = {folds}, but the data set '{demos.name}' has {demos.episodes} episodes, and every fold must hold "
+            f"out at least one. Ask for at most {demos.episodes} folds."
         )
     return folds
 
@@ -78,21 +78,7 @@ def _draw(episodes: int, folds: int, test_share: float, seed: int) -> list[Fold]
     else:
         tests = np.array_split(shuffled, folds)
     everything = set(range(episodes))
-    return [
-        Fold(tuple(sorted(everything - set(test.tolist()))), tuple(sorted(test.tolist()))) for test in tests
-    ]
-
-
-def save_split(split: Split, path: Path) -> None:
-    """Write a split as JSON."""
-    path.write_text(json.dumps(asdict(split)))
-
-
-def load_split(path: Path) -> Split:
-    """The inverse of `save_split`."""
-    stored = json.loads(path.read_text())
-    folds = tuple(Fold(tuple(fold["train"]), tuple(fold["test"])) for fold in stored["folds"])
-    return Split(folds, stored["seed"], stored["hash"])
+    return [Fold(tuple(sorted(everything - set(test.tolist()))), tuple(sorted(test.tolist()))) for test in tests]
 
 
 def _hash(content_hash: str, folds: list[Fold]) -> str:

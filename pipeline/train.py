@@ -1,7 +1,7 @@
 """Train any method on windows, and keep what came of it in a folder.
 
-What belongs here: one call for every method, and its files: safetensors and JSON, never pickles. What does not: how a method
-learns (`policies`), or where folders lie (`store`).
+What belongs here: one call for every method, and its files: safetensors and JSON, never pickles. What does not: how a
+method learns (`policies`), or where folders lie (`store`).
 
     weights.safetensors   all arrays of the policy; two policies are the same when these bytes are
     policy.json           method and settings
@@ -56,8 +56,8 @@ def train_policy(
 
     Parameters
     ----------
-    checkpoint : a file. Training goes on from it where it belongs to the same windows and settings, and keeps it up to date;
-        it stays there afterwards. The weights are the same bytes as without a break.
+    checkpoint : a file. Training goes on from it where it belongs to the same windows and settings, and keeps it up to
+        date; it stays there afterwards. The weights are the same bytes as without a break.
     on_step : called with (step, steps, mean loss of the seeds) about 200 times.
 
     Raises

@@ -1,7 +1,7 @@
 """Windows as indices: which frames are anchors, which frames each sees, and which actions follow.
 
-What belongs here: the rules that say where a window may lie, and gathering one batch of windows. What does not: learning
-anything. Frames are never copied for a whole data set: memory is O(frames), whatever the history and the chunk.
+What belongs here: the rules that say where a window may lie, and gathering one batch of windows. What does not:
+learning anything. Frames are never copied for a whole data set: memory is O(frames), whatever history and chunk are.
 """
 
 import hashlib
@@ -84,7 +84,7 @@ class Windows:
         return np.maximum(frames, self.first_frame[index, None])
 
     def target_frames(self, index: np.ndarray | slice | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """[B, K] the frames of each window's actions, kept inside the episode, and the mask that says which really are."""
+        """[B, K] the frames of each window's actions, kept inside the episode, and a mask of those that really are."""
         index = slice(None) if index is None else index
         frames = self.anchors[index, None] + np.arange(self.chunk)
         last = self.end_frame[index, None] - 1
@@ -102,7 +102,7 @@ class Windows:
         return Observations(self.values[frames], state, previous, anchors)
 
     def targets(self, index: np.ndarray | slice | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """The recorded actions [B, K, A] and a mask [B, K]: False past the end of the episode, where they mean nothing."""
+        """The recorded actions [B, K, A], and a mask [B, K]: False past the end, where an action means nothing."""
         frames, mask = self.target_frames(index)
         return self.demos.columns[ACTION][frames], mask
 
@@ -149,7 +149,7 @@ def make_windows(
     Parameters
     ----------
     episodes : positions; those that train, or those held out.
-    statistics_episodes : the episodes that train. Under `notebook` statistics come from all episodes, whatever is given.
+    statistics_episodes : the episodes that train. Under `notebook` statistics come from all, whatever is given.
     history : the benchmark's history. Anchors depend on it alone (`strict`), so that all policies share them.
     own_history : the frames that this policy sees, where they differ; `every_frame` sees one.
 
@@ -177,8 +177,17 @@ def make_windows(
     own = 1 if recipe == "every_frame" else own_history or history
     statistics = range(demos.episodes) if protocol == "notebook" else sorted(statistics_episodes)
     return Windows(
-        demos, semantics, observation_set, tuple(sorted(episodes)), tuple(statistics), protocol, recipe, own, chunk, anchors
-    )  # fmt: skip
+        demos=demos,
+        semantics=semantics,
+        observation_set=observation_set,
+        episodes=tuple(sorted(episodes)),
+        statistics_episodes=tuple(statistics),
+        protocol=protocol,
+        recipe=recipe,
+        history=own,
+        chunk=chunk,
+        anchors=anchors,
+    )
 
 
 def _check_features(demos: Demonstrations, observation_set: ObservationSet) -> None:
@@ -186,8 +195,8 @@ def _check_features(demos: Demonstrations, observation_set: ObservationSet) -> N
         if key not in demos.columns:
             known = [name for name in demos.columns if name != ACTION]
             raise ConfigError(
-                f"The observation set '{observation_set.name}' asks for '{key}', which the data set '{demos.name}' does not "
-                f"have as numbers. {did_you_mean(key, known)}"
+                f"The observation set '{observation_set.name}' asks for '{key}', which the data set '{demos.name}' "
+                f"does not have as numbers. {did_you_mean(key, known)}"
             )
 
 
@@ -196,12 +205,12 @@ def _check_lengths(demos: Demonstrations, history: int, chunk: int) -> None:
     shortest = int(lengths.argmin())
     if lengths[shortest] < history:
         raise DatasetError(
-            f"Episode {demos.episode_ids[shortest]} of '{demos.name}' has {lengths[shortest]} frames, fewer than the history "
-            f"of {history}. Set [benchmark] history to at most {lengths[shortest]}, or remove the episode."
+            f"Episode {demos.episode_ids[shortest]} of '{demos.name}' has {lengths[shortest]} frames, and the "
+            f"history is {history}. Set [benchmark] history to at most {lengths[shortest]}, or remove the episode."
         )
     largest = int(lengths.max()) - history + 1
     if chunk > largest:
         raise ConfigError(
-            f"A chunk of {chunk} actions is longer than every episode of '{demos.name}': after {history} frames of history "
-            f"the longest ({lengths.max()} frames) leaves {largest}. Ask for chunks of at most {largest}."
+            f"A chunk of {chunk} actions is longer than every episode of '{demos.name}': after {history} frames of "
+            f"history the longest ({lengths.max()} frames) leaves {largest}. Ask for chunks of at most {largest}."
         )

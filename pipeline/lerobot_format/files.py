@@ -39,7 +39,7 @@ def fill(template: str, values: Mapping[str, int | str]) -> str:
         if field not in values or conversion or not _SPEC.fullmatch(spec or ""):
             known = ", ".join(values)
             raise DatasetError(
-                f"meta/info.json: the path '{template}' uses '{{{field}}}' in a way that is not known here. Known: {known}."
+                f"meta/info.json: the path '{template}' uses '{{{field}}}' in a way that is not known. Known: {known}."
             )
         parts.append(format(values[field], spec or ""))
     return "".join(parts)
@@ -65,7 +65,7 @@ def inside(folder: Path, relative: str) -> Path:
 
 
 def _home(folder: Path) -> Path:
-    """Where the folder's files may really lie: in it, or, for a snapshot in the Hub's cache, among that repository's blobs."""
+    """Where the folder's files may really lie: in it, or, for a snapshot in the Hub's cache, among its blobs."""
     real = folder.resolve()
     repository = real.parent.parent
     if real.parent.name == "snapshots" and (repository / "blobs").is_dir():
@@ -126,7 +126,7 @@ def open_parquet(folder: Path, relative: str) -> "pq.ParquetFile":
         return pq.ParquetFile(path)
     except FileNotFoundError:
         raise DatasetError(
-            f"{path} is missing, though the data set's own lists name it. Copy the data set again, or download it whole."
+            f"{path} is missing, though the data set's own lists name it. Copy or download the data set again."
         ) from None
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(f"{path} {_damage(error)}") from None
@@ -146,4 +146,6 @@ def read_table(folder: Path, relative: str, keep: Callable[[str], bool] = lambda
 
 def _damage(error: Exception) -> str:
     reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-    return f"cannot be read as parquet: it is cut off or damaged. Copy the data set again. (parquet says: {reason[:160]})"
+    return (
+        f"cannot be read as parquet: it is cut off or damaged. Copy the data set again. (parquet says: {reason[:160]})"
+    )

@@ -70,7 +70,9 @@ def read_frames(layout: Layout) -> Frames:
             for key, target in index.items():
                 target[rows] = _numbers(layout, file, group, key, 1)[:, 0]
             row = rows.stop
-    warnings += [f"Feature '{key}' holds whole numbers too large for float32; they were rounded." for key in sorted(large)]
+    warnings += [
+        f"Feature '{key}' holds whole numbers too large for float32; they were rounded." for key in sorted(large)
+    ]
     return Frames(
         columns=columns,
         file_of=np.repeat(np.arange(len(counts)), counts),
@@ -83,7 +85,7 @@ def read_frames(layout: Layout) -> Frames:
 
 
 def _survey(layout: Layout) -> tuple[list[int], set[str], list[str]]:
-    """From the footers alone: frames of each file, columns that every file has, and notes on those that only some have."""
+    """From the footers alone: frames of each file, columns that every file has, notes on those that some lack."""
     counts: list[int] = []
     everywhere: set[str] | None = None
     somewhere: set[str] = set()
@@ -95,7 +97,8 @@ def _survey(layout: Layout) -> tuple[list[int], set[str], list[str]]:
         for key in (ACTION, STATE):
             if key not in names:
                 raise DatasetError(
-                    f"{layout.folder / file} has no column '{key}', which meta/info.json declares. It has: {', '.join(sorted(names))}."
+                    f"{layout.folder / file} has no column '{key}', which meta/info.json declares. "
+                    f"It has: {', '.join(sorted(names))}. Record the column, or correct meta/info.json."
                 )
         everywhere = names if everywhere is None else everywhere & names
         somewhere |= names
@@ -126,8 +129,8 @@ def _check_memory(layout: Layout, total: int, features: dict[str, Feature]) -> N
     free = psutil.virtual_memory().available
     if needed > 0.8 * free:
         raise DatasetError(
-            f"{layout.folder}: its {total:,} frames need {needed / 2**30:.1f} GB of memory, {free / 2**30:.1f} GB are free. "
-            "Use a part of the data set, or a machine with more memory."
+            f"{layout.folder}: its {total:,} frames need {needed / 2**30:.1f} GB of memory, "
+            f"{free / 2**30:.1f} GB are free. Use a part of the data set, or a machine with more memory."
         )
 
 
@@ -181,6 +184,7 @@ def _is_list(kind: "pa.DataType") -> bool:
 
 def _wrong(layout: Layout, file: str, key: str, width: int, got: str) -> DatasetError:
     return DatasetError(
-        f"{layout.folder / file}: column '{key}' has {got}; meta/info.json declares {width} number{'s' if width > 1 else ''} a frame. "
+        f"{layout.folder / file}: column '{key}' has {got}; "
+        f"meta/info.json declares {width} number{'s' if width > 1 else ''} a frame. "
         "Correct the shape in meta/info.json, or record the column again."
     )

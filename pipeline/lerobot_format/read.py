@@ -1,7 +1,7 @@
 """A source → Demonstrations.
 
-What belongs here: putting frames and meta/ together, and every check between them: an error where a difference would make a
-number wrong, a warning where not. What does not: what columns mean (quality.py), downloading (hub.py).
+What belongs here: putting frames and meta/ together, and every check between them: an error where a difference would
+make a number wrong, a warning where not. What does not: what columns mean (quality.py), downloading (hub.py).
 """
 
 import hashlib
@@ -61,8 +61,8 @@ def read_dataset(
 def _episode_starts(layout: Layout, frames: Frames) -> np.ndarray:
     """[E + 1]; the frames are checked to be whole episodes, in order, one after another.
 
-    The lists in meta/ give the lengths (`read_frames` has compared the totals a file); index columns, where they are there,
-    must agree.
+    The lists in meta/ give the lengths (`read_frames` has compared the totals of each file); index columns, where they
+    are there, must agree.
     """
     lengths = np.array([entry.length for entry in layout.episodes], np.int64)
     starts = np.concatenate([[0], np.cumsum(lengths)])
@@ -70,7 +70,9 @@ def _episode_starts(layout: Layout, frames: Frames) -> np.ndarray:
     files = {file: position for position, file in enumerate(layout.files)}
     expected_file = np.repeat([files[entry.file] for entry in layout.episodes], lengths)
     if (expected_file != frames.file_of).any():
-        raise DatasetError(f"{layout.folder}: meta/ spreads consecutive episodes over files out of order. Sort the episodes by file.")
+        raise DatasetError(
+            f"{layout.folder}: meta/ spreads consecutive episodes over files out of order. Sort the episodes by file."
+        )
     if frames.episode_id is not None and (frames.episode_id != ids).any():
         frame = int(np.flatnonzero(frames.episode_id != ids)[0])
         raise DatasetError(
@@ -83,8 +85,9 @@ def _episode_starts(layout: Layout, frames: Frames) -> np.ndarray:
         if (frames.frame_index != expected).any():
             frame = int(np.flatnonzero(frames.frame_index != expected)[0])
             raise DatasetError(
-                f"{layout.folder}: episode {ids[frame]} has frame_index {frames.frame_index[frame]} where {expected[frame]} "
-                "was expected: frames are missing or out of order. Sort the frames, or record the episode again."
+                f"{layout.folder}: episode {ids[frame]} has frame_index {frames.frame_index[frame]} where "
+                f"{expected[frame]} was expected: frames are missing or out of order. "
+                "Sort the frames, or record the episode again."
             )
     return starts
 
@@ -164,7 +167,9 @@ def load_source(source: str, *, name: str, config_dir: Path, videos: bool = Fals
         from pipeline.lerobot_format.hub import fetch
 
         copy = fetch(source.removeprefix(HUB), videos=videos)
-        demonstrations = read_dataset(copy.folder, name=name, source=source, revision=copy.commit, videos_expected=videos)
+        demonstrations = read_dataset(
+            copy.folder, name=name, source=source, revision=copy.commit, videos_expected=videos
+        )
         return _with_warnings(demonstrations, copy.warnings)
     return read_dataset(_folder(source, config_dir), name=name, source=source)
 
@@ -177,18 +182,22 @@ def _with_warnings(demonstrations: Demonstrations, more: tuple[str, ...]) -> Dem
 
 def _folder(source: str, config_dir: Path) -> Path:
     if "://" in source:
-        raise DatasetError(f"The source '{source}' is a URL. Give a folder, hub:owner/name[@revision], or embedded:pusht_sim.")
+        raise DatasetError(
+            f"The source '{source}' is a URL. Give a folder, hub:owner/name[@revision], or embedded:pusht_sim."
+        )
     folder = config_dir / Path(source).expanduser()
     if not folder.exists() and source.count("/") == 1 and not source.startswith((".", "~", "/")):
-        raise DatasetError(f"The data set's folder {folder} does not exist. For a data set on the Hub write hub:{source}.")
+        raise DatasetError(
+            f"The data set's folder {folder} does not exist. For a data set on the Hub write hub:{source}."
+        )
     return folder
 
 
 def source_stamp(source: str, config_dir: Path) -> dict[str, Any]:
     """What makes a source stale, found without reading it: JSON-able, equal while nothing has changed.
 
-    Folder: its path and a digest of the paths, sizes and times of its files. Hub: the commit the revision stands for now (as
-    the cache last saw it where the Hub is out of reach). Embedded: the bytes themselves, which are few.
+    Folder: its path and a digest of the paths, sizes and times of its files. Hub: the commit that the revision stands
+    for now (as the cache last saw it where the Hub is out of reach). Embedded: the bytes themselves, which are few.
 
     Raises:
         DatasetError: no such folder or name.
@@ -199,13 +208,20 @@ def source_stamp(source: str, config_dir: Path) -> dict[str, Any]:
         folder = embedded_folder(source.removeprefix(EMBEDDED))
         digest = hashlib.sha256()
         for path in _data_files(folder):
-            digest.update(f"{path.relative_to(folder).as_posix()}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
+            digest.update(
+                f"{path.relative_to(folder).as_posix()}\0".encode() + hashlib.sha256(path.read_bytes()).digest()
+            )
         return {"kind": "embedded", "name": source.removeprefix(EMBEDDED), "digest": digest.hexdigest()}
     if source.startswith(HUB):
         from pipeline.lerobot_format.hub import current_commit, parse_repository
 
         repository, revision = parse_repository(source.removeprefix(HUB))
-        return {"kind": "hub", "repository": repository, "revision": revision, "commit": current_commit(repository, revision)}
+        return {
+            "kind": "hub",
+            "repository": repository,
+            "revision": revision,
+            "commit": current_commit(repository, revision),
+        }
     folder = _folder(source, config_dir)
     if not folder.is_dir():
         read_layout(folder)  # its message says what is wrong
@@ -214,7 +230,13 @@ def source_stamp(source: str, config_dir: Path) -> dict[str, Any]:
         stat = path.stat()
         digest.update(f"{path.relative_to(folder).as_posix()}\0{stat.st_size}\0{stat.st_mtime_ns}\n".encode())
         count, size = count + 1, size + stat.st_size
-    return {"kind": "folder", "path": str(folder.resolve()), "files": count, "bytes": size, "digest": digest.hexdigest()}
+    return {
+        "kind": "folder",
+        "path": str(folder.resolve()),
+        "files": count,
+        "bytes": size,
+        "digest": digest.hexdigest(),
+    }
 
 
 def _data_files(folder: Path) -> list[Path]:

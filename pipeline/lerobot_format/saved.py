@@ -1,7 +1,7 @@
 """Demonstrations on disk, and the hash of what is in them.
 
-One .npy a column, so that it can be mapped into memory in no time, and meta.json for the rest. Nothing here reads LeRobot's
-own layout.
+One .npy a column, so that it can be mapped into memory in no time, and meta.json for the rest. Nothing here reads
+LeRobot's own layout.
 """
 
 import hashlib
@@ -63,7 +63,8 @@ def save_demonstrations(demonstrations: Demonstrations, folder: Path) -> None:
         "fps": demonstrations.fps,
         "robot_type": demonstrations.robot_type,
         "features": [
-            {"key": key, "names": demonstrations.features[key].names, "units": demonstrations.features[key].units} for key in keys
+            {"key": key, "names": demonstrations.features[key].names, "units": demonstrations.features[key].units}
+            for key in keys
         ],
         "tasks": demonstrations.tasks,
         "cameras": [vars(camera) for camera in demonstrations.cameras],
@@ -82,7 +83,8 @@ def load_demonstrations(folder: Path) -> Demonstrations:
     try:
         meta = json.loads((folder / _META).read_text(encoding="utf-8"))
         features = {
-            block["key"]: Feature(block["key"], tuple(block["names"]), tuple(block["units"])) for block in meta["features"]
+            block["key"]: Feature(block["key"], tuple(block["names"]), tuple(block["units"]))
+            for block in meta["features"]
         }
         columns = {
             key: np.load(folder / f"column-{position:03d}.npy", mmap_mode="r", allow_pickle=False)
@@ -103,5 +105,6 @@ def load_demonstrations(folder: Path) -> Demonstrations:
         )
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StoreError(
-            f"The demonstrations kept in {folder} cannot be read ({type(error).__name__}: {error}). Remove the folder and run again."
+            f"The demonstrations kept in {folder} cannot be read ({type(error).__name__}: {error}). "
+            "Remove the folder and run again."
         ) from None

@@ -46,8 +46,8 @@ def unit_of(name: str) -> str | None:
 def column_names(key: str, declared: Any, width: int) -> tuple[str, ...] | None:
     """Names for the `width` columns of a feature, or None where `names` is there but does not fit.
 
-    `declared` is `names` in info.json: a flat list, one nested in a mapping (`{"motors": [...]}`), several such lists one
-    after another, a mapping name → position, or nothing.
+    `declared` is `names` in info.json: a flat list, one nested in a mapping (`{"motors": [...]}`), several such lists
+    one after another, a mapping name → position, or nothing.
     """
     names = list(_flat(declared))
     if not names:

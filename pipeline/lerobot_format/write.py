@@ -53,8 +53,9 @@ def write_dataset(
 ) -> None:
     """Write a data set. It appears under its name only when it is whole.
 
-    `features` holds the episodes one after another; `tasks` has the words for each episode; `timestamps` [N] are seconds from
-    the start of each episode, by default frame / fps. `extra_info` adds keys to info.json. Equal arguments, equal bytes.
+    `features` holds the episodes one after another; `tasks` has the words for each episode; `timestamps` [N] are
+    seconds from the start of each episode, by default frame / fps. `extra_info` adds keys to info.json. Equal
+    arguments, equal bytes.
 
     Raises:
         StoreError: the folder exists already and is not empty, or cannot be written.
@@ -79,7 +80,9 @@ def write_dataset(
             folder.rmdir()
         temporary.rename(folder)
     except OSError as error:
-        raise StoreError(f"{folder} cannot be written: {error.strerror or error}. Free some room, or choose another place.") from None
+        raise StoreError(
+            f"{folder} cannot be written: {error.strerror or error}. Free some room, or choose another place."
+        ) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -95,7 +98,9 @@ def _columns(
     counts = np.asarray(lengths, np.int64)
     total = int(counts.sum())
     if len(counts) == 0 or (counts < 1).any() or len(tasks) != len(counts):
-        raise ValueError(f"{len(counts)} episodes with lengths {list(lengths)[:5]}… and {len(tasks)} tasks do not make a data set")
+        raise ValueError(
+            f"{len(counts)} episodes with lengths {list(lengths)[:5]}… and {len(tasks)} tasks do not make a data set"
+        )
     columns = {}
     for key, (names, values, dtype) in features.items():
         values = np.asarray(values, dtype=dtype).reshape(len(values), -1)
@@ -150,7 +155,9 @@ def _array(values: np.ndarray) -> "pa.Array":
     return flat if values.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
 
 
-def _write_episodes(folder: Path, columns: Mapping[str, FeatureArrays], places: list[_Place], tasks: Sequence[str]) -> None:
+def _write_episodes(
+    folder: Path, columns: Mapping[str, FeatureArrays], places: list[_Place], tasks: Sequence[str]
+) -> None:
     count = len(places)
     table: dict[str, Any] = {
         "episode_index": list(range(count)),
@@ -172,9 +179,21 @@ def _write_episodes(folder: Path, columns: Mapping[str, FeatureArrays], places: 
 def _write_tasks(folder: Path, tasks: Iterable[str]) -> None:
     """meta/tasks.parquet as a pandas frame indexed by the words: that is how LeRobot looks a task up."""
     words = list(dict.fromkeys(tasks))
-    column = {"field_name": "task_index", "metadata": None, "name": "task_index", "numpy_type": "int64", "pandas_type": "int64"}
+    column = {
+        "field_name": "task_index",
+        "metadata": None,
+        "name": "task_index",
+        "numpy_type": "int64",
+        "pandas_type": "int64",
+    }
     index = {"field_name": "task", "metadata": None, "name": "task", "numpy_type": "object", "pandas_type": "unicode"}
-    labels = {"field_name": None, "metadata": {"encoding": "UTF-8"}, "name": None, "numpy_type": "object", "pandas_type": "unicode"}
+    labels = {
+        "field_name": None,
+        "metadata": {"encoding": "UTF-8"},
+        "name": None,
+        "numpy_type": "object",
+        "pandas_type": "unicode",
+    }
     pandas = {
         "index_columns": ["task"], "column_indexes": [labels], "columns": [column, index],
         "creator": {"library": "pyarrow", "version": "20.0.0"}, "pandas_version": "2.2.0",

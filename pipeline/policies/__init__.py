@@ -2,12 +2,12 @@
 
 A method is a class whose objects are fitted policies:
 
-    fit(windows, plan) → (policy, Curve | None)   learns from the windows' anchors, all seeds together
-    predict(observations, horizons) → [S, B, K, A]  raw units in, raw units out, float32; `horizons` is how many actions a
-                                                  policy without a chunk is asked for, others answer their K
-    arrays(), settings()                          all that a fitted policy is: named arrays, and JSON
-    restore(arrays, settings) → policy            the inverse
-    seeds, chunk, parameters                      `chunk` is None where there is none; `parameters` are one network's
+    fit(windows, plan) → (policy, Curve | None)     learns from the windows' anchors, all seeds together
+    predict(observations, horizons) → [S, B, K, A]  raw units in and out, float32; `horizons` is how many actions a
+                                                    policy without a chunk is asked for, others answer their K
+    arrays(), settings()                            all that a fitted policy is: named arrays, and JSON
+    restore(arrays, settings) → policy              the inverse
+    seeds, chunk, parameters                        `chunk` is None where there is none; `parameters` are one network's
 
 A policy owns its transform, and its arrays hold it. `METHODS` holds what the rest of the project may ask about a method
 without importing torch; files are written and read by `pipeline.train`.
@@ -42,7 +42,10 @@ class Plan:
 
 @dataclass(frozen=True)
 class Curve:
-    """Training losses: steps [L], losses [S, L], each the mean since the entry before; seconds of training, all seeds."""
+    """Training losses, and the seconds that all seeds took together.
+
+    steps [L]      losses [S, L], each the mean since the entry before
+    """
 
     steps: np.ndarray
     losses: np.ndarray
@@ -53,8 +56,8 @@ class Curve:
 class Method:
     """Where a method lives and what a benchmark must know before building it.
 
-    chunk              "set": the config names chunk sizes, one policy each; "one": always a single action; "none": it can
-                       be asked for any horizon and is scored on all
+    chunk              "set": the config names chunk sizes, one policy each; "one": always a single action; "none": it
+                       can be asked for any horizon and is scored on all
     trained            it has seeds and training steps (and is rolled out where there is a simulator)
     uses_observations  its answer depends on the observation set; else it runs once a data set
     recipe             which windows it is made for (`windows.Recipe`)

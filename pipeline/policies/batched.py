@@ -1,11 +1,13 @@
-"""Several networks of one shape as one: every layer's weights of all seeds in one tensor, one batched product a layer.
+"""Several networks of one shape as one: each layer's weights of all seeds in one tensor, one batched product a layer.
 
-What belongs here: building, asking and storing such a stack. What does not: what goes in and comes out, or how it is trained.
+What belongs here: building, asking and storing such a stack. What does not: what goes in and comes out, or how it is
+trained.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -23,7 +25,7 @@ class Stack:
 
     @classmethod
     def fresh(cls, sizes: Sequence[int], seeds: Sequence[int], dtype: torch.dtype, device: str) -> "Stack":
-        """Networks as `torch.nn.Linear` draws them after `torch.manual_seed(seed)`, without touching the global generator."""
+        """Networks as `torch.nn.Linear` draws them after `torch.manual_seed(seed)`, with a generator of their own."""
         networks = [_draw(sizes, seed) for seed in seeds]
         layers = range(len(sizes) - 1)
         weights = [torch.stack([network[i][0] for network in networks]) for i in layers]
@@ -71,10 +73,10 @@ class Stack:
 
 
 def _draw(sizes: Sequence[int], seed: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """One network's (weight [in, out], bias [1, out]) a layer: uniform within ±1/√in, in float32, weight before bias."""
+    """One network's (weight [in, out], bias [1, out]) a layer: uniform within ±1/√in, float32, weight before bias."""
     generator = torch.Generator().manual_seed(seed)
     layers = []
-    for inputs, outputs in zip(sizes[:-1], sizes[1:], strict=True):
+    for inputs, outputs in pairwise(sizes):
         bound = 1 / math.sqrt(inputs)
         weight = torch.empty(outputs, inputs).uniform_(-bound, bound, generator=generator)
         bias = torch.empty(1, outputs).uniform_(-bound, bound, generator=generator)

@@ -1,7 +1,7 @@
 """Training a stack of networks on windows: batches, steps, checkpoints.
 
-What belongs here: the loop, which goes on from a checkpoint to the same bytes as without a break. What does not: the choice of
-loss, sizes and rates (each policy's own file), or files of finished policies (`pipeline.train`).
+What belongs here: the loop, which goes on from a checkpoint to the same bytes as without a break. What does not: the
+choice of loss, sizes and rates (each policy's own file), or files of finished policies (`pipeline.train`).
 """
 
 import hashlib
@@ -22,6 +22,7 @@ from safetensors.torch import save_file
 from pipeline.errors import PolicyError
 from pipeline.policies import Curve, Plan
 from pipeline.policies.batched import Stack
+from pipeline.types import ACTION
 from pipeline.windows import Windows
 
 LOSSES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"l1": torch.abs, "squared": torch.square}
@@ -69,7 +70,7 @@ class Gather:
     def __init__(self, windows: Windows, dtype: torch.dtype, device: str):
         scaling, demos = windows.normalizer, windows.demos
         first, end = int(windows.first_frame.min()), int(windows.end_frame.max())
-        actions = scaling.actions.encode(demos.columns["action"][first:end])
+        actions = scaling.actions.encode(demos.columns[ACTION][first:end])
         self.inputs = torch.from_numpy(scaling.observations.encode(windows.values[first:end])).to(device, dtype)
         self.actions = torch.from_numpy(actions).to(device, dtype)
         self._anchors = torch.from_numpy(windows.anchors - first).to(device)
@@ -80,7 +81,7 @@ class Gather:
         self._ragged = bool((windows.anchors + windows.chunk > windows.end_frame).any())
 
     def __call__(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """[S, B] window numbers → inputs [S, B, T · O'], actions [S, B, K · A'] and their mask [S, B, K · A'], or None."""
+        """[S, B] window numbers → inputs [S, B, T · O'], actions [S, B, K · A'] and their mask (None: all count)."""
         anchors = self._anchors[index]
         seen = torch.maximum(anchors[..., None] + self._back, self._first[index][..., None])
         ahead, last = anchors[..., None] + self._ahead, self._last[index][..., None]
@@ -93,16 +94,14 @@ class Gather:
 
 
 def seed_losses(error: torch.Tensor, mask: torch.Tensor | None, loss: str) -> torch.Tensor:
-    """[S] each seed's mean loss over the targets inside their episode; `error` [S, B, K · A'] is prediction − target."""
+    """[S] each seed's mean loss over targets inside their episode; `error` [S, B, K · A'] is prediction − target."""
     size = LOSSES[loss](error)
     if mask is None:
         return size.mean(dim=(1, 2))
     return (size * mask).sum(dim=(1, 2)) / mask.sum(dim=(1, 2)).clamp(min=1)
 
 
-def fit_stack(
-    windows: Windows, recipe: Recipe, plan: Plan, dtype: torch.dtype = torch.float32
-) -> tuple[Stack, Curve]:
+def fit_stack(windows: Windows, recipe: Recipe, plan: Plan, dtype: torch.dtype = torch.float32) -> tuple[Stack, Curve]:
     """Train one network a seed, all seeds in each step together; the sum of their losses keeps them independent.
 
     Raises
@@ -165,8 +164,8 @@ class _Training:
         losses = mean.tolist()
         if not all(math.isfinite(loss) for loss in losses):
             raise PolicyError(
-                f"Training stopped at step {self.done} of {plan.steps}: the loss of a seed is {losses}. Look for values "
-                "that are not finite or far out of range with `demobench inspect`."
+                f"Training stopped at step {self.done} of {plan.steps}: the losses of the seeds are {losses}. Look for "
+                "values that are not finite or far out of range with `demobench inspect`."
             )
         self.steps.append(self.done)
         self.losses.append(losses)

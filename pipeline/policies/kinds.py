@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.normalize import wrap
+from pipeline.lerobot_format.kinds import wrap
+from pipeline.normalize import circular_columns, frames_of
 from pipeline.types import ACTION, STATE, Observations
 from pipeline.windows import Windows
 
@@ -75,17 +76,18 @@ def columns_of(windows: Windows) -> Columns:
         column if kind == "position" and column is not None and has_state else -1
         for kind, column in zip(windows.semantics.kinds, windows.semantics.state_column, strict=True)
     ]
-    strict = windows.protocol == "strict"
-    circular = windows.semantics.circular.get(ACTION, (False,) * len(kinds))
-    circular = np.array(circular, bool) & strict
+    circular = circular_columns(windows.demos, windows.semantics, [ACTION]) & (windows.protocol == "strict")
     return Columns(
-        np.array(state_column, np.int64), np.isin(kinds, ("velocity", "delta")), circular, mean_action(windows, circular)
+        state_column=np.array(state_column, np.int64),
+        still=np.isin(kinds, ("velocity", "delta")),
+        circular=circular,
+        mean=mean_action(windows, circular),
     )
 
 
 def mean_action(windows: Windows, circular: np.ndarray) -> np.ndarray:
     """[A] the mean action over all frames of the windows' episodes; for angles the mean direction."""
-    actions = np.concatenate([windows.demos.columns[ACTION][windows.demos.episode(e)] for e in windows.episodes])
+    actions = windows.demos.columns[ACTION][frames_of(windows.demos, windows.episodes)]
     mean = actions.mean(axis=0, dtype=np.float64)
     angles = actions[:, circular].astype(np.float64)
     mean[circular] = np.arctan2(np.sin(angles).mean(axis=0), np.cos(angles).mean(axis=0))

@@ -1,7 +1,7 @@
 """A multi-layer perceptron that answers a whole chunk of actions at once.
 
-What belongs here: its sizes and rates, and what goes in and comes out. What does not: the batched networks (`batched`) and
-their training (`fitting`).
+What belongs here: its sizes and rates, and what goes in and comes out. What does not: the batched networks (`batched`)
+and their training (`fitting`).
 """
 
 from collections.abc import Mapping

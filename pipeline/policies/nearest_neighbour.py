@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from pipeline.normalize import Normalizer
+from pipeline.normalize import Normalizer, frames_of
 from pipeline.policies import Plan
 from pipeline.types import ACTION, Observations
 from pipeline.windows import Windows
@@ -43,7 +43,7 @@ class NearestNeighbour:
     def fit(cls, windows: Windows, plan: Plan) -> tuple[Self, None]:
         """Remember the windows' episodes. `plan` is not used."""
         demos = windows.demos
-        kept = np.concatenate([np.arange(demos.frames)[demos.episode(e)] for e in windows.episodes])
+        kept = frames_of(demos, windows.episodes)
         row = np.full(demos.frames, -1, np.int64)
         row[kept] = np.arange(len(kept))
         policy = cls(
@@ -70,9 +70,9 @@ class NearestNeighbour:
     def search(self, observations: Observations, horizons: int) -> np.ndarray:
         """[B, K] which window is nearest at each horizon.
 
-        Candidates are taken in order of how far they reach, so that the candidates of horizon h are all those seen by the
-        time h is answered, and one pass over the distances answers every horizon. Of equally near windows the one that
-        reaches farthest is taken (counting no farther than the last horizon), then the earliest.
+        Candidates are taken in order of how far they reach, so that the candidates of horizon h are all those seen by
+        the time h is answered, and one pass over the distances answers every horizon. Of equally near windows the one
+        that reaches farthest is taken (counting no farther than the last horizon), then the earliest.
         """
         encoded = self.normalizer.observations.encode(observations.values)
         queries = encoded.reshape(len(encoded), -1).astype(np.float64)

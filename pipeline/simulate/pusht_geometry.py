@@ -21,11 +21,13 @@ FINGER_PX = 15.0
 """Radius of the finger."""
 STANDOFF_PX = 6.0
 """Between finger and block when a push begins."""
-WALK_PX = 2.0
-"""A path keeps at least this far from the block …"""
-ESCAPE_PX = 8.0
-"""… and a finger that is closer steps back to here first."""
-RING_PX = 13.0
+WALK_PX = 10.0
+"""A path keeps at least this far from the block, because a fast finger cuts corners; …"""
+ARRIVE_PX = 2.0
+"""… only its last leg, which ends next to the block, may come this close."""
+ESCAPE_PX = 12.0
+"""A finger that is closer than a path may come steps back to here first."""
+RING_PX = 16.0
 """The ring around the block, which paths follow when the block is in their way, leaves this much room."""
 RING_POINTS = 28
 
@@ -118,11 +120,11 @@ def _ring() -> tuple[Point, ...]:
     return tuple(points if ring.is_ccw else points[::-1])
 
 
-def is_clear(a: Point, b: Point) -> bool:
-    """True where a finger that moves straight from a to b keeps away from the block."""
+def is_clear(a: Point, b: Point, gap: float) -> bool:
+    """True where a finger that moves straight from a to b leaves `gap` px between itself and the block."""
     import shapely
 
-    return not _grown(WALK_PX).intersects(shapely.LineString([a, b]))
+    return not _grown(gap).intersects(shapely.LineString([a, b]))
 
 
 def walk(start: Point, goal: Point, direction: int) -> list[Point] | None:
@@ -141,21 +143,21 @@ def walk(start: Point, goal: Point, direction: int) -> list[Point] | None:
         edge = _grown(ESCAPE_PX).exterior
         here = edge.interpolate(edge.project(shapely.Point(start))).coords[0]
         path.append(here)
-    if is_clear(here, goal):
+    if is_clear(here, goal, ARRIVE_PX):
         return [*path, goal]
-    first, last = _ring_entry(here), _ring_entry(goal)
+    first, last = _ring_entry(here, WALK_PX), _ring_entry(goal, ARRIVE_PX)
     if first is None or last is None:
         return None
     ring = _ring()
     around = [ring[(first + direction * k) % RING_POINTS] for k in range((direction * (last - first)) % RING_POINTS + 1)]
-    return path[:-1] + _pull_tight([here, *around, goal])
+    return path[:-1] + _pull_tight([here, *around]) + [goal]
 
 
-def _ring_entry(point: Point) -> int | None:
+def _ring_entry(point: Point, gap: float) -> int | None:
     """The nearest point of the ring that can be reached in a straight line."""
     ring = _ring()
     for i in sorted(range(RING_POINTS), key=lambda i: math.dist(ring[i], point)):
-        if is_clear(ring[i], point):
+        if is_clear(ring[i], point, gap):
             return i
     return None
 
@@ -165,7 +167,7 @@ def _pull_tight(points: list[Point]) -> list[Point]:
     path, k = [points[0]], 0
     while k < len(points) - 1:
         further = len(points) - 1
-        while further > k + 1 and not is_clear(points[k], points[further]):
+        while further > k + 1 and not is_clear(points[k], points[further], WALK_PX):
             further -= 1
         path.append(points[further])
         k = further

@@ -37,6 +37,7 @@ WALK_SPEED_PX = 24.0
 PUSH_SPEED_PX = 12.0
 """Px that the target moves in a frame. The finger lags about two frames behind."""
 PAUSE_FRAMES = 2
+PAUSE_BEFORE = 2
 """The target rests this long before a push and after it, so that the finger arrives."""
 ANGLE_PX = 100.0
 """What a radian of the block's angle weighs against px of its mass centre. More than on the block's rim (60 px), so that the
@@ -46,6 +47,8 @@ FRAME_PX = 0.3
 NEAR_PX = 40.0
 """… and in proportion less when the block is nearer to the goal than this."""
 LONGEST_PUSH_PX = 140.0
+BEYOND_PX = (0.0, 1.5, 3.0)
+"""A push is tried with its last target this far beyond the place that the finger should reach: it lags, and leaves early."""
 SHORTLIST = 8
 """Pushes that are tried in full, with the walk to them …"""
 LOOKAHEAD = 4
@@ -72,6 +75,7 @@ class Push:
     targets: list[Point]
     block: Pose
     cost: float
+    walk: int = 0
 
 
 @dataclass(frozen=True)
@@ -109,8 +113,13 @@ class Planner:
     def next_push(self, state: State) -> Push | None:
         """The best push found, or None where the finger can get nowhere."""
         frame_px = FRAME_PX * min(1.0, self.distance(state.block) / NEAR_PX)
-        pushes = [self._try_in_full(state, idea, frame_px) for idea in self._ideas(state.block, frame_px)[:SHORTLIST]]
-        pushes = sorted((push for push in pushes if push), key=lambda push: push.cost)[:LOOKAHEAD]
+        pushes = []
+        for idea in self._ideas(state.block, frame_px)[:SHORTLIST]:
+            path = self._walk(state, idea.contact)
+            if path is not None:
+                tried = [self._try_in_full(state, path, idea, beyond, frame_px) for beyond in BEYOND_PX]
+                pushes.append(min(tried, key=lambda push: push.cost))
+        pushes = sorted(pushes, key=lambda push: push.cost)[:LOOKAHEAD]
         return min(pushes, key=lambda push: self._cost_after_another(push, frame_px), default=None)
 
     def _cost_after_another(self, push: Push, frame_px: float) -> float:
@@ -118,7 +127,7 @@ class Planner:
         distance, costs = self.distance(push.block), []
         for idea in self._ideas(push.block, frame_px):
             walk_px = math.dist(push.targets[-1], to_world(push.block, idea.contact.finger(STANDOFF_PX)))
-            costs.append(idea.cost + frame_px * (walk_px / WALK_SPEED_PX + 2 * PAUSE_FRAMES))
+            costs.append(idea.cost + frame_px * (walk_px / WALK_SPEED_PX + (PAUSE_FRAMES+PAUSE_BEFORE)))
         return push.cost - distance + min(distance, *costs)
 
     def _ideas(self, block: Pose, frame_px: float) -> list[_Idea]:
@@ -147,20 +156,19 @@ class Planner:
                 break
         return best
 
-    def _try_in_full(self, state: State, idea: _Idea, frame_px: float) -> Push | None:
+    def _try_in_full(self, state: State, path: list[Point], idea: _Idea, beyond: float, frame_px: float) -> Push:
         """The same push with the walk to it, frame by frame, as the demonstrator would carry it out."""
-        path = self._walk(state, idea.contact)
-        if path is None:
-            return None
-        standoff = path[-1]
-        targets = targets_along(path, WALK_SPEED_PX) + [standoff] * PAUSE_FRAMES
-        targets += targets_along([standoff, idea.end], PUSH_SPEED_PX) + [idea.end] * PAUSE_FRAMES
+        inwards = to_world((0.0, 0.0, state.block[2]), (-idea.contact.out_x, -idea.contact.out_y))
+        standoff, end = path[-1], (idea.end[0] + beyond * inwards[0], idea.end[1] + beyond * inwards[1])
+        targets = targets_along(path, WALK_SPEED_PX) + [standoff] * PAUSE_BEFORE
+        walk_n = len(targets)
+        targets += targets_along([standoff, end], PUSH_SPEED_PX) + [end] * PAUSE_FRAMES
         targets = [_recordable(target) for target in targets]
         self._place(state)
         for target in targets:
             advance(self._trial, *target)
         block = state_of(self._trial).block
-        return Push(targets, block, self.distance(block) + frame_px * len(targets))
+        return Push(targets, block, self.distance(block) + frame_px * len(targets), walk_n)
 
     def _walk(self, state: State, contact: Contact) -> list[Point] | None:
         """The way to a contact, on the table: around the block in the preferred direction unless that is a long detour."""

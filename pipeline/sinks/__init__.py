@@ -25,7 +25,8 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     except OSError as error:
         raise StoreError(
-            f"{path} cannot be written: {error.strerror or error}. Free some space or choose another folder with --store."
+            f"{path} cannot be written: {error.strerror or error}. Free some space or choose another folder with "
+            "--store."
         ) from error
     finally:
         with suppress(OSError):

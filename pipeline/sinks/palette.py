@@ -1,13 +1,14 @@
-"""Colours and dashes: the same for a policy in every chart, on the page and in every recording.
+"""Colours, dashes and the looks of charts: a policy has the same everywhere, recordings included.
 
 What belongs here: which colour means what, on light and on dark ground. What does not: drawing.
 
-The hues are those of Okabe & Ito (2008), told apart with any common colour blindness; each is darkened for white paper and
-lightened for dark ground. Baselines are near-grey and dashed, so that colour is left for what was trained.
+The hues are those of Okabe & Ito (2008), told apart with any common colour blindness; each is darkened for white
+paper and lightened for dark ground. Baselines are near-grey and dashed, so that colour is left for what was trained.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -77,3 +78,21 @@ def dash_of(policy: str) -> tuple[int, ...]:
 def all_colours() -> tuple[Colour, ...]:
     """Every colour that a chart may use; no two are the same on light ground."""
     return (INK, MUTED, GRID, SUCCESS, FAILURE, *TRAINED, *BASELINES.values())
+
+
+CONFIG: dict[str, Any] = {
+    "font": "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif",
+    "background": "#ffffff",
+    "view": {"stroke": None},
+    "axis": {
+        "labelColor": MUTED.light, "titleColor": MUTED.light, "gridColor": GRID.light, "domain": False, "ticks": False,
+        "labelPadding": 6, "labelFontSize": 11, "titleFontSize": 12, "titleFontWeight": "normal", "titlePadding": 8,
+        "labelFlush": False,
+    },
+    "legend": {
+        "labelColor": INK.light, "orient": "bottom", "title": None, "labelFontSize": 12, "symbolStrokeWidth": 2.5,
+        "symbolSize": 160, "columnPadding": 14, "labelLimit": 220, "columns": 3,
+    },
+    "text": {"color": INK.light, "fontSize": 12},
+}  # fmt: skip
+"""How every chart looks; given to Vega-Lite beside the chart, on the page and for pictures alike."""

@@ -2,13 +2,13 @@
 
     /joint_states                        sensor_msgs/JointState   `observation.state`
     /joint_commands                      sensor_msgs/JointState   the recorded action
-    /policy/<policy>/<observations>      sensor_msgs/JointState   the policy's first action at each anchor (its first seed)
+    /policy/<policy>/<observations>      sensor_msgs/JointState   the policy's first action at each anchor (first seed)
     /episode                             std_msgs/String          at each episode's first frame: its number and task
 
 What belongs here: message layout, topics and times. What does not: choosing episodes, errors.
 
-Times are the demonstrations' own clock. Episodes follow one another with `GAP_S` between them, the first one starting at
-`GAP_S`, because a stamp of zero means "not set" in ROS.
+Times are the demonstrations' own clock. Episodes follow one another with `GAP_S` between them, the first one starting
+at `GAP_S`, because a stamp of zero means "not set" in ROS.
 """
 
 import re
@@ -87,7 +87,7 @@ def write_mcap(
 
 
 def policy_topics(predictions: Sequence[Predictions]) -> list[str]:
-    """The topic of each policy × observation set. ROS 2 names hold letters, digits and `_` only; the rest becomes `_`."""
+    """The topic of each policy × observation set. ROS 2 names hold letters, digits and `_`; the rest becomes `_`."""
     topics: list[str] = []
     for one in predictions:
         topic = f"/policy/{_token(one.policy)}/{_token(one.observations)}"
@@ -165,5 +165,22 @@ def _describe(
         described["state_names"] = ", ".join(demos.features[STATE].names)
         described["state_units"] = ", ".join(unit or "unknown" for unit in demos.features[STATE].units)
     for topic, one in zip(policy_topics(predictions), predictions, strict=True):
-        described[topic] = f"policy {one.policy}, observations {one.observations}, seed {one.seeds[0] if one.seeds else 0}"
+        described[topic] = (
+            f"policy {one.policy}, observations {one.observations}, seed {one.seeds[0] if one.seeds else 0}"
+        )
     return described
+
+
+def expected_messages(demos: Demonstrations, predictions: Sequence[Predictions], episodes: Sequence[int]) -> int:
+    """How many messages a file of these episodes holds, counted from the data alone."""
+    frames = [demos.episode(episode) for episode in episodes]
+    recorded = (2 if STATE in demos.columns else 1) * sum(span.stop - span.start for span in frames)
+    return len(episodes) + recorded + sum(len(one.in_frames(span)) for one in predictions for span in frames)
+
+
+def count_messages(path: Path) -> int:
+    """How many messages the file's own reader finds, reading every one of them."""
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        return sum(1 for _ in make_reader(file).iter_messages())

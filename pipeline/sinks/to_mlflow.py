@@ -32,6 +32,7 @@ def _client(uri: str) -> Iterator[Any]:
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "15")
     import logging
 
+    # MLflow reports about itself on the terminal; what matters here comes as an exception.
     for noisy in ("alembic", "mlflow.store.db.utils", "mlflow.tracking.fluent"):
         logging.getLogger(noisy).setLevel(logging.ERROR)
     import mlflow

@@ -2,17 +2,18 @@
 
     /episode_007/joints/<column>          [frames, series] the state, the recorded action, each policy's first action
     /episode_007/error                    [frames, policies] mean |first action − recorded action| over the columns
-    /episode_007/path/…                   two-dimensional positions only: where it went, and the chunk predicted just now
+    /episode_007/path/…                   positions in a plane only: where it went, and the chunk predicted just now
 
 What belongs here: entities, their looks, the blueprint, the viewer. What does not: choosing episodes, scores.
 
-Time lines: `time`, seconds from the start of each episode (episodes lie over one another), and `frame`. Policies are shown
-by their first seed, at the frames at which they were asked; elsewhere a series has a gap.
+Time lines: `time`, seconds from the start of each episode (episodes lie over one another), and `frame`. Policies are
+shown by their first seed, at the frames at which they were asked; elsewhere a series has a gap.
 """
 
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,14 +26,14 @@ from pipeline.sinks import replacing
 from pipeline.sinks.palette import BASELINES, INK, MUTED, is_baseline, policy_colours
 from pipeline.types import ACTION, STATE, Demonstrations, Predictions, Semantics
 
-TIME, FRAME = "time", "frame"
+TIME, FRAME, EPISODE = "time", "frame", "episode_"
 HIDDEN_AT_FIRST = ("constant_velocity", "mean_action")
 Rgb = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
 class Series:
-    """One line of a plot: its name in the legend, colour on dark ground, width in points, whether it is shown at first."""
+    """One line of a plot: name in the legend, colour on dark ground, width in points, whether it shows at first."""
 
     name: str
     colour: Rgb
@@ -72,9 +73,17 @@ def write_rerun(
             _send_joints(recording, demos, semantics, predictions, episode, lines)
             _send_error(recording, demos, semantics, predictions, episode, lines[2:])
             if has_paths(demos, semantics):
-                _send_paths(recording, demos, predictions, episode, lines[2:])
+                _send_paths(recording, demos, semantics, predictions, episode, lines[2:])
         recording.flush()
         recording.disconnect()
+
+
+def episodes_in(path: Path) -> set[int]:
+    """The recorded numbers of the episodes that a recording holds, by Rerun's own reader."""
+    from rerun.chunk import RrdReader
+
+    roots = {entity.split("/")[1] for entity in RrdReader(path).store().schema().entity_paths()}
+    return {int(root.removeprefix(EPISODE)) for root in roots if root.startswith(EPISODE)}
 
 
 def view(path: Path, *, wait: bool = True) -> subprocess.Popen:
@@ -91,7 +100,8 @@ def view(path: Path, *, wait: bool = True) -> subprocess.Popen:
     except OSError as error:
         raise StoreError(f"The Rerun viewer cannot be started: {error}. `rerun {path}` opens the same file.") from error
     if wait:
-        viewer.wait()
+        with suppress(KeyboardInterrupt):
+            viewer.wait()
     return viewer
 
 
@@ -107,7 +117,7 @@ def has_paths(demos: Demonstrations, semantics: Semantics) -> bool:
 
 def episode_root(demos: Demonstrations, episode: int) -> str:
     """The root entity of an episode, by its recorded number: `/episode_007`."""
-    return f"/episode_{demos.episode_ids[episode]:03d}"
+    return f"/{EPISODE}{demos.episode_ids[episode]:03d}"
 
 
 def _recorded_series() -> list[Series]:
@@ -126,7 +136,7 @@ def _policy_series(predictions: Sequence[Predictions]) -> list[Series]:
         paler = min(0.4 * known.index(one.observations), 0.8)
         red, green, blue = (round(c + (255 - c) * paler) for c in colours[one.policy].rgb_on_dark)
         name = one.policy if len(known) == 1 else f"{one.policy} ({one.observations})"
-        width = 1.0 if is_baseline(one.policy) else 1.75
+        width = 1.0 if is_baseline(one.policy) else 1.5
         found.append(Series(name, (red, green, blue), width, one.policy not in HIDDEN_AT_FIRST))
     return found
 
@@ -182,12 +192,14 @@ def _send_joints(recording, demos, semantics, predictions, episode, series) -> N
     action = demos.columns[ACTION][frames]
     predicted = [_first_actions(one, frames, action.shape[1]) for one in predictions]
     for column, joint in enumerate(_column_names(demos)):
-        state = np.full(len(action), np.nan)
-        if semantics.state_column[column] is not None and semantics.kinds[column] == "position":
-            state = demos.columns[STATE][frames, semantics.state_column[column]]
-        values = np.stack([state, action[:, column], *(p[:, column] for p in predicted)], axis=1)
-        entity = rr.new_entity_path([*episode_root(demos, episode).strip("/").split("/"), "joints", joint])
-        _send_series(recording, entity, _times(demos, frames), series, values)
+        values = [action[:, column], *(p[:, column] for p in predicted)]
+        where = semantics.state_column[column]
+        has_state = where is not None and semantics.kinds[column] == "position"
+        if has_state:
+            values.insert(0, demos.columns[STATE][frames, where])
+        shown = series if has_state else series[1:]
+        entity = rr.new_entity_path([episode_root(demos, episode).strip("/"), "joints", joint])
+        _send_series(recording, entity, _times(demos, frames), shown, np.stack(values, axis=1))
 
 
 def _send_error(recording, demos, semantics, predictions, episode, series) -> None:
@@ -205,13 +217,13 @@ def _send_error(recording, demos, semantics, predictions, episode, series) -> No
     _send_series(recording, entity, _times(demos, frames), series, np.stack(errors, axis=1))
 
 
-def _send_paths(recording, demos, predictions, episode, series) -> None:
+def _send_paths(recording, demos, semantics, predictions, episode, series) -> None:
     """Where the state went (static), where it is now, and the chunk that each policy predicts now."""
     import rerun as rr
 
     frames = demos.episode(episode)
     root = f"{episode_root(demos, episode)}/path"
-    state = demos.columns[STATE][frames][:, :2]
+    state = demos.columns[STATE][frames][:, list(semantics.state_column)]
     recording.log(f"{root}/recorded", rr.LineStrips2D([state], colors=[MUTED.rgb_on_dark], draw_order=0), static=True)
     dot = rr.Points2D.columns(positions=state, colors=[INK.rgb_on_dark] * len(state), radii=np.full(len(state), -4.0))
     recording.send_columns(f"{root}/state", _times(demos, frames), dot)
@@ -253,7 +265,9 @@ def _tab(demos: Demonstrations, semantics: Semantics, episode: int) -> Any:
     if not has_paths(demos, semantics):
         return rrb.Vertical(*plots, row_shares=[2, 1], name=title)
     hidden = [f"- {root}/path/{policy}/**" for policy in BASELINES]
-    path = rrb.Spatial2DView(origin=f"{root}/path", contents=["+ $origin/**", *hidden], name="path and predicted chunks")
+    path = rrb.Spatial2DView(
+        origin=f"{root}/path", contents=["+ $origin/**", *hidden], name="path and predicted chunks"
+    )
     return rrb.Horizontal(rrb.Vertical(*plots), path, name=title)
 
 
@@ -268,7 +282,7 @@ def _joint_views(demos: Demonstrations, root: str) -> list[Any]:
         views.append(
             rrb.TimeSeriesView(
                 origin=rr.new_entity_path([root.strip("/"), "joints", entity]),
-                name=f"{title} · white recorded action, grey state",
+                name=f"{title} · white: recorded",
                 plot_legend=rrb.PlotLegend(visible=False),
             )
         )
@@ -284,7 +298,8 @@ def _error_view(demos: Demonstrations, root: str, episode: int) -> Any:
     unit = next(iter(units)) if len(units) == 1 else "mixed units"
     end_s = float(demos.timestamps[demos.episode(episode)].max())
     room = rr.TimeRange(
-        start=rr.TimeRangeBoundary.absolute(seconds=0.0), end=rr.TimeRangeBoundary.absolute(seconds=max(end_s, 0.1) * 1.4)
+        start=rr.TimeRangeBoundary.absolute(seconds=0.0),
+        end=rr.TimeRangeBoundary.absolute(seconds=max(end_s, 0.1) * 1.4),
     )
     return rrb.TimeSeriesView(
         origin=f"{root}/error",

@@ -16,9 +16,9 @@ def mean_interval(values: np.ndarray, counts: np.ndarray | None = None, *, level
 
     Parameters
     ----------
-    values : [S, E] each episode's mean error for each seed; seeds are averaged first, so the interval is for these seeds.
-    counts : [E] how many targets each mean is over. Given, the mean is over targets (Σ counts · value / Σ counts) and the
-        interval that of a ratio estimator (Cochran 1977, § 6.4); left out, every episode counts once.
+    values : [S, E] each episode's mean error for each seed; seeds are averaged first: the interval is for these seeds.
+    counts : [E] how many targets each mean is over. Given, the mean is over targets (Σ counts · value / Σ counts) and
+        the interval that of a ratio estimator (Cochran 1977, § 6.4); left out, every episode counts once.
     level : the coverage claimed.
 
     Returns

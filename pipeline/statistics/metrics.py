@@ -1,10 +1,10 @@
 """From predictions to errors on held-out episodes.
 
-What belongs here: comparing predicted with recorded actions, and summing within episodes and across them. What does not:
-intervals (`intervals`), floors (`floors`), the table.
+What belongs here: comparing predicted with recorded actions, and summing within episodes and across them. What does
+not: intervals (`intervals`), floors (`floors`), the table.
 
-Under `strict` a metric is the mean over episodes of each episode's mean, averaged over seeds: an episode counts once. Under
-`notebook` it is the mean over frames.
+Under `strict` a metric is the mean over episodes of each episode's mean, averaged over seeds: an episode counts once.
+Under `notebook` it is the mean over frames.
 """
 
 from dataclasses import dataclass, replace
@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from pipeline.folds import PolicyTask
-from pipeline.normalize import dead_columns, wrap
+from pipeline.lerobot_format.kinds import wrap
+from pipeline.lerobot_format.quality import dead_columns
+from pipeline.normalize import circular_columns, frames_of
 from pipeline.policies import METHODS, Plan
 from pipeline.predict import join_folds, predict_policy, temporal_ensemble
 from pipeline.statistics.intervals import Interval, mean_interval
-from pipeline.types import ACTION, Demonstrations, EpisodeErrors, Fold, Predictions, Protocol, Semantics, Split
-from pipeline.windows import Windows, make_windows
+from pipeline.types import ACTION, Demonstrations, EpisodeErrors, Predictions, Protocol, Semantics, Split
 
 
 def episode_errors(
@@ -27,7 +28,7 @@ def episode_errors(
 ) -> EpisodeErrors:
     """Sum the errors of predictions within each held-out episode, for every seed, horizon and action column.
 
-    A prediction for a frame past the end of its episode counts nowhere. Errors of circular columns are wrapped (`strict`).
+    A prediction for a frame past the end of its episode counts nowhere. Errors of angles are wrapped (`strict`).
     """
     recorded = demos.columns[ACTION]
     starts = demos.episode_starts
@@ -39,7 +40,7 @@ def episode_errors(
     anchors = np.zeros((len(episodes), horizons), np.int64)
     absolute = np.zeros((seeds, len(episodes), horizons, columns))
     squared, l2 = np.zeros_like(absolute), np.zeros((seeds, len(episodes), horizons))
-    circular = circular_actions(semantics, columns, protocol)
+    circular = circular_actions(demos, semantics, protocol)
     for horizon in range(horizons):
         inside = np.flatnonzero(predictions.anchors + horizon < starts[of_anchor + 1])
         target = recorded[predictions.anchors[inside] + horizon].astype(np.float64)
@@ -55,10 +56,9 @@ def episode_errors(
     return EpisodeErrors(episodes, fold, anchors, absolute, squared, l2, _scales(demos, split, fold, circular))
 
 
-def circular_actions(semantics: Semantics, columns: int, protocol: Protocol) -> np.ndarray:
-    """[A] bool: the action columns whose errors are wrapped."""
-    circular = np.array(semantics.circular.get(ACTION, (False,) * columns), bool)
-    return circular if protocol == "strict" else np.zeros_like(circular)
+def circular_actions(demos: Demonstrations, semantics: Semantics, protocol: Protocol) -> np.ndarray:
+    """[A] bool: the action columns whose errors are wrapped; the notebook wraps none."""
+    return circular_columns(demos, semantics, [ACTION]) & (protocol == "strict")
 
 
 def _sum_by(group: np.ndarray, values: np.ndarray, groups: int) -> np.ndarray:
@@ -70,13 +70,14 @@ def _scales(demos: Demonstrations, split: Split, fold: np.ndarray, circular: np.
     """[E, A] the deviation of the training actions of each episode's fold; NaN for columns that do not move."""
     scales = {}
     for number in np.unique(fold):
-        actions = np.concatenate([demos.columns[ACTION][demos.episode(e)] for e in split.folds[number].train])
+        frames = frames_of(demos, split.folds[number].train)
+        actions = demos.columns[ACTION][frames]
         deviation = actions.std(axis=0, dtype=np.float64)
         if circular.any():
             angles = actions[:, circular].astype(np.float64)
             middle = np.arctan2(np.sin(angles).mean(axis=0), np.cos(angles).mean(axis=0))
             deviation[circular] = np.sqrt((wrap(angles - middle) ** 2).mean(axis=0))
-        deviation[dead_columns(actions, demos.features[ACTION].units)] = np.nan
+        deviation[dead_columns(demos, ACTION, frames)] = np.nan
         scales[number] = deviation
     return np.stack([scales[number] for number in fold])
 
@@ -88,7 +89,7 @@ def per_episode(sums: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def estimate(values: np.ndarray, counts: np.ndarray, protocol: Protocol) -> float:
-    """The estimand of a protocol from episode means `values` [S, E] over `counts` [E] targets; NaN where there are none."""
+    """What a protocol estimates, from episode means `values` [S, E] over `counts` [E] targets; NaN without targets."""
     use = counts > 0
     if not use.any() or np.isnan(values[:, use]).any():
         return float("nan")
@@ -101,13 +102,14 @@ def summarise(errors: EpisodeErrors, *, protocol: Protocol, fps: float, chunk: i
 
     Parameters
     ----------
-    chunk : K, or None for a policy without one; `whole_chunk_*` is None there, and `at_one_second_*` where K ≤ round(fps).
+    chunk : K, or None for a policy without one: `whole_chunk_*` is None there, as is `at_one_second_*` where
+        K ≤ round(fps).
 
     Returns
     -------
     dict : `first_step_mae|rmse|l2`, `at_one_second_mae|rmse`, `whole_chunk_mae|rmse`, `scaled` (floats or None),
-        `error_by_horizon`, `rmse_by_horizon` [H], `error_by_joint`, `scaled_by_joint` [A] (NaN where dead) and `interval`,
-        a dict of metric → (low, high) or None.
+        `error_by_horizon`, `rmse_by_horizon` [H], `error_by_joint`, `scaled_by_joint` [A] (NaN where dead) and
+        `interval`, a dict of metric → (low, high) or None.
     """
     second = round(fps)
     reached = errors.anchors.shape[1]
@@ -116,8 +118,9 @@ def summarise(errors: EpisodeErrors, *, protocol: Protocol, fps: float, chunk: i
         del spans["at_one_second"]
     if chunk is None:
         del spans["whole_chunk"]
-    found: dict[str, Any] = {f"{name}_{kind}": None for name in ("at_one_second", "whole_chunk") for kind in ("mae", "rmse")}
-    interval: dict[str, Interval | None] = {f"{name}_mae": None for name in ("at_one_second", "whole_chunk")}
+    optional = ("at_one_second", "whole_chunk")
+    found: dict[str, Any] = {f"{name}_{kind}": None for name in optional for kind in ("mae", "rmse")}
+    interval: dict[str, Interval | None] = {f"{name}_mae": None for name in optional}
     for name, span in spans.items():
         absolute, counts = span_means(errors, errors.absolute, span)
         squared, _ = span_means(errors, errors.squared, span)
@@ -174,7 +177,7 @@ def _interval(values: np.ndarray, counts: np.ndarray, protocol: Protocol) -> Int
 
 @dataclass(frozen=True)
 class Score:
-    """One policy scored: its errors by episode, all metrics (JSON-able, None where not applicable), and those of each seed."""
+    """One policy scored: errors by episode, all metrics (JSON-able, None where not applicable), and each seed's."""
 
     errors: EpisodeErrors
     metrics: dict[str, Any]
@@ -194,7 +197,8 @@ def score_task(task: PolicyTask, predictions: Predictions) -> Score:
     metrics["hold_still_by_horizon"] = _by_horizon(still, protocol)["error_by_horizon"]
     reference = metrics["hold_still_by_horizon"][0]
     if protocol == "notebook" and chunk not in (None, 1):
-        reference = _by_horizon(_errors_of(task, _hold_still(task, 1, chunk=1)), protocol)["error_by_horizon"][0]
+        single = replace(task, variant=replace(task.variant, chunk=1))
+        reference = _by_horizon(_errors_of(task, _hold_still(single, 1)), protocol)["error_by_horizon"][0]
     metrics["vs_hold_still"] = reference / metrics["first_step_mae"] if metrics["first_step_mae"] > 0 else None
     metrics["ensembled_first_step_mae"] = _ensembled(task, predictions) if chunk and chunk > 1 else None
     names = task.demos.features[ACTION].names
@@ -206,22 +210,21 @@ def score_task(task: PolicyTask, predictions: Predictions) -> Score:
 
 
 def _errors_of(task: PolicyTask, predictions: Predictions) -> EpisodeErrors:
-    return episode_errors(
-        predictions, task.demos, task.semantics, task.split, protocol=task.experiment.protocol
-    )  # fmt: skip
+    protocol = task.experiment.protocol
+    return episode_errors(predictions, task.demos, task.semantics, task.split, protocol=protocol)
 
 
 def _only(errors: EpisodeErrors, seed: int) -> dict[str, np.ndarray]:
     return {name: getattr(errors, name)[seed : seed + 1] for name in ("absolute", "squared", "l2")}
 
 
-def _hold_still(task: PolicyTask, horizons: int, chunk: int | None = None) -> Predictions:
-    """Hold-still at the task's own anchors, or at those of another chunk size."""
+def _hold_still(task: PolicyTask, horizons: int) -> Predictions:
+    """Hold-still at the task's own anchors."""
     hold_still = METHODS["hold_still"].load_class()
     parts = []
     for number, fold in enumerate(task.split.folds):
-        policy, _ = hold_still.fit(_windows(task, fold, fold.train, chunk), Plan((0,), 0))
-        held_out = _windows(task, fold, fold.test, chunk)
+        policy, _ = hold_still.fit(task.windows(fold.train, fold), Plan((0,), 0))
+        held_out = task.windows(fold.test, fold)
         name, observations = "hold_still", task.observation_set.name
         parts.append(
             predict_policy(policy, held_out, name=name, observations=observations, fold=number, horizons=horizons)
@@ -229,24 +232,10 @@ def _hold_still(task: PolicyTask, horizons: int, chunk: int | None = None) -> Pr
     return join_folds(parts)
 
 
-def _windows(task: PolicyTask, fold: Fold, episodes: tuple[int, ...], chunk: int | None) -> Windows:
-    return make_windows(
-        task.demos,
-        task.semantics,
-        task.observation_set,
-        episodes,
-        statistics_episodes=fold.train,
-        protocol=task.experiment.protocol,
-        history=task.experiment.history,
-        chunk=chunk or task.variant.chunk or 1,
-        recipe=METHODS[task.variant.method].recipe,
-    )
-
-
 def _ensembled(task: PolicyTask, predictions: Predictions) -> float:
     """The first-step error when a policy is asked at every frame and its chunks are averaged."""
-    protocol, columns = task.experiment.protocol, predictions.actions.shape[3]
-    circular = circular_actions(task.semantics, columns, protocol)
+    protocol = task.experiment.protocol
+    circular = circular_actions(task.demos, task.semantics, protocol)
     starts = task.demos.episode_starts
     averaged = temporal_ensemble(predictions.actions, predictions.anchors, starts, circular=circular)
     errors = _errors_of(task, replace(predictions, actions=averaged[:, :, None]))

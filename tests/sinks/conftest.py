@@ -1,11 +1,21 @@
-"""Fixtures for everything that writes files: one small data set with what was predicted, scored and rolled out on it."""
+"""Fixtures for everything that writes files: a small data set with what was predicted and rolled out on it."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.types import ACTION, Demonstrations, Fold, Neighbourhood, Predictions, RadiusFloor, Rollouts, Semantics, Split
+from pipeline.types import (
+    ACTION,
+    Demonstrations,
+    Fold,
+    Neighbourhood,
+    Predictions,
+    RadiusFloor,
+    Rollouts,
+    Semantics,
+    Split,
+)
 
 from .making import make_demos, make_predictions, make_semantics
 

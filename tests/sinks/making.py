@@ -8,7 +8,11 @@ NASTY = "<script>window.pwned = true</script>"
 
 
 def make_demos(
-    columns: int = 2, lengths: tuple[int, ...] = (30, 24, 36), fps: float = 10.0, units: str | None = "px", seed: int = 0
+    columns: int = 2,
+    lengths: tuple[int, ...] = (30, 24, 36),
+    fps: float = 10.0,
+    units: str | None = "px",
+    seed: int = 0,
 ) -> Demonstrations:
     """Smooth curves: the action is where the state will be two frames later."""
     rng = np.random.default_rng(seed)
@@ -61,5 +65,10 @@ def make_predictions(
     targets = np.minimum(anchors[:, None] + np.arange(chunk), last[:, None])
     actions = demos.columns[ACTION][targets] + off
     return Predictions(
-        policy, observations, (0, 1), anchors, np.zeros(len(anchors), int), np.stack([actions, actions + 1]).astype("f4")
+        policy,
+        observations,
+        (0, 1),
+        anchors,
+        np.zeros(len(anchors), int),
+        np.stack([actions, actions + 1]).astype("f4"),
     )

@@ -22,7 +22,9 @@ def read(path: Path) -> dict[str, list]:
     """Topic → [(log time in ns, message)] by the `mcap` reader."""
     found: dict[str, list] = {}
     with path.open("rb") as file:
-        for _, channel, record, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+        for _, channel, record, message in make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
             found.setdefault(channel.topic, []).append((record.log_time, message))
     return found
 
@@ -118,7 +120,11 @@ def test_a_data_set_without_a_state_has_commands_only(tmp_path, demos, semantics
 def test_topics_are_ros_names_and_never_shared(demos):
     names = [("act-v1.2", "pose+image"), ("act_v1_2", "pose_image"), ("1nn", "state")]
     predictions = [replace(make_predictions(demos, [0]), policy=p, observations=o) for p, o in names]
-    assert policy_topics(predictions) == ["/policy/act_v1_2/pose_image", "/policy/act_v1_2/pose_image_", "/policy/_1nn/state"]
+    assert policy_topics(predictions) == [
+        "/policy/act_v1_2/pose_image",
+        "/policy/act_v1_2/pose_image_",
+        "/policy/_1nn/state",
+    ]
 
 
 def test_a_failure_leaves_the_earlier_file_and_nothing_half_written(tmp_path, demos, semantics, predictions):

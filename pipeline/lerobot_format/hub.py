@@ -1,0 +1,246 @@
+"""Data sets on the Hugging Face Hub: a revision becomes a commit, and a commit a folder on this machine.
+
+What belongs here: names, the cache, the network and its failures. What does not: what is in the folder (read.py).
+Tokens stay inside `huggingface_hub`; no message here repeats what a server or a header said.
+"""
+
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from pipeline.errors import HubError
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+
+KIND = "dataset"
+TIMEOUT_S = 15.0
+"""Longest wait for one answer of the Hub."""
+
+_REPOSITORY = re.compile(r"[A-Za-z0-9_][\w.-]{0,95}/[A-Za-z0-9_][\w.-]{0,95}", re.ASCII)
+_REVISION = re.compile(r"[\w][\w./+-]{0,199}", re.ASCII)
+_COMMIT = re.compile(r"[0-9a-f]{40}")
+
+
+@dataclass(frozen=True)
+class HubCopy:
+    """A copy on this machine: its folder, the commit it is of, and what the user should know about it."""
+
+    folder: Path
+    commit: str
+    warnings: tuple[str, ...] = ()
+
+
+class _OutOfReach(Exception):
+    """The Hub gave no answer, or none but that it is broken. Never leaves this module."""
+
+
+def parse_repository(text: str) -> tuple[str, str | None]:
+    """`owner/name[@revision]` → the repository and the revision, None for the newest.
+
+    Raises:
+        HubError: it is not of that form.
+    """
+    repository, at, revision = text.partition("@")
+    if not _REPOSITORY.fullmatch(repository) or ".." in repository or (at and not _is_revision(revision)):
+        raise HubError(
+            f"'hub:{text}' does not name a data set on the Hub. Write hub:owner/name, or hub:owner/name@revision with "
+            "a branch, a tag or a commit."
+        )
+    return repository, revision or None
+
+
+def _is_revision(text: str) -> bool:
+    return bool(_REVISION.fullmatch(text)) and ".." not in text
+
+
+def fetch(text: str, *, videos: bool = False) -> HubCopy:
+    """The data set `owner/name[@revision]` on this machine: meta/ and data/, and videos/ where asked for.
+
+    A pinned commit that is whole in the cache needs no network. Otherwise the Hub is asked; where it is out of reach
+    the newest copy in the cache stands in, and the warnings say so.
+
+    Raises:
+        HubError: there is no such data set or revision, access is refused, no room, or the Hub is out of reach and
+            there is no whole copy in the cache.
+    """
+    repository, revision = parse_repository(text)
+    patterns = ["meta/*", "data/*", *(["videos/*"] if videos else [])]
+    pinned = revision is not None and _COMMIT.fullmatch(revision)
+    if pinned and (copy := _cached(repository, revision, patterns, listed=True)):
+        return copy
+    try:
+        commit = _ask(repository, revision, patterns, TIMEOUT_S)
+        return _download(repository, revision, commit, patterns)
+    except _OutOfReach as reason:
+        problem = f"The Hub ({_host()}) is out of reach ({reason})"
+    copy = _cached(repository, revision, patterns, listed=False)
+    if copy is None:
+        raise HubError(
+            f"{problem}, and there is no whole copy of '{text}' on this machine. "
+            "Connect to the network and run again, or give a folder."
+        )
+    newest = "" if pinned else " The Hub may hold a newer one."
+    note = f"{problem}; the copy of commit {copy.commit[:12]} in the cache was read.{newest}"
+    return HubCopy(copy.folder, copy.commit, (note,))
+
+
+def current_commit(repository: str, revision: str | None) -> str | None:
+    """The commit that a revision stands for now: by the Hub, else as the cache last saw it, else None. Never raises."""
+    if revision and _COMMIT.fullmatch(revision):
+        return revision
+    try:
+        return _ask(repository, revision, None, TIMEOUT_S / 3)
+    except (_OutOfReach, HubError):
+        return _cached_commit(repository, revision)
+
+
+def _ask(repository: str, revision: str | None, patterns: list[str] | None, timeout: float) -> str:
+    """The commit of a revision by the Hub; with `patterns`, after a look at whether its files fit on the disk."""
+    with _failures_of(repository, revision):
+        info = _api().dataset_info(repository, revision=revision, timeout=timeout, files_metadata=patterns is not None)
+    if not isinstance(info.sha, str) or not _COMMIT.fullmatch(info.sha):
+        raise HubError(f"The Hub ({_host()}) gave no commit for '{repository}'. Is HF_ENDPOINT a Hub?")
+    if patterns is not None:
+        wanted = tuple(pattern.rstrip("*") for pattern in patterns)
+        here = _cache_folder() / f"datasets--{repository.replace('/', '--')}" / "snapshots" / info.sha
+        files = [file for file in info.siblings or [] if file.rfilename.startswith(wanted)]
+        _check_room(repository, sum(file.size or 0 for file in files if not (here / file.rfilename).exists()))
+    return info.sha
+
+
+def _check_room(repository: str, size: int) -> None:
+    folder = next(parent for parent in (_cache_folder(), *_cache_folder().parents) if parent.exists())
+    free = shutil.disk_usage(folder).free
+    if size > free:
+        raise HubError(
+            f"'{repository}' needs {size / 2**30:.1f} GB more, and {free / 2**30:.1f} GB are free in {folder}. "
+            "Make room, or set HF_HOME to a folder on a larger disk."
+        )
+
+
+def _download(repository: str, revision: str | None, commit: str, patterns: list[str]) -> HubCopy:
+    """Download what is not in the cache yet. The commit is the one whose files came, should a branch move meanwhile."""
+    from huggingface_hub import snapshot_download
+
+    with _failures_of(repository, revision):
+        _api()  # bounds the session's waits
+        folder = snapshot_download(
+            repository,
+            repo_type=KIND,
+            revision=revision or "main",
+            cache_dir=_cache_folder(),
+            allow_patterns=patterns,
+            endpoint=_endpoint(),
+        )
+    return HubCopy(Path(folder), Path(folder).name if _COMMIT.fullmatch(Path(folder).name) else commit)
+
+
+def _cached(repository: str, revision: str | None, patterns: list[str], *, listed: bool) -> HubCopy | None:
+    """The copy in the cache, if it is whole. `listed` asks for proof: a list of the commit's files to compare with.
+
+    Without a list (a cache filled by other means) a copy counts as whole when it has its meta/info.json; reading it
+    will show what is missing.
+    """
+    from huggingface_hub import get_cached_repo_tree, snapshot_download
+    from huggingface_hub.errors import CachedRepoTreeNotFoundError, IncompleteSnapshotError, LocalEntryNotFoundError
+
+    place = {"repo_type": KIND, "revision": revision or "main", "cache_dir": _cache_folder()}
+    try:
+        if listed:
+            get_cached_repo_tree(repository, **place)
+        folder = Path(snapshot_download(repository, local_files_only=True, allow_patterns=patterns, **place))
+    except (CachedRepoTreeNotFoundError, IncompleteSnapshotError, LocalEntryNotFoundError, OSError):
+        return None
+    return HubCopy(folder, folder.name) if (folder / "meta/info.json").exists() else None
+
+
+def _cached_commit(repository: str, revision: str | None) -> str | None:
+    from huggingface_hub.errors import RevisionResolutionError
+
+    try:
+        return (
+            _api()
+            .resolve_revision(
+                repository, repo_type=KIND, revision=revision, cache_dir=_cache_folder(), local_files_only=True
+            )
+            .resolved
+        )
+    except (RevisionResolutionError, OSError):
+        return None
+
+
+def _api() -> "HfApi":
+    """The client, with an end to every wait: the library's own session would wait for ever."""
+    from huggingface_hub import HfApi, get_session
+
+    get_session().timeout = TIMEOUT_S
+    return HfApi(endpoint=_endpoint())
+
+
+@contextmanager
+def _failures_of(repository: str, revision: str | None) -> Iterator[None]:
+    """Failures of a request → `HubError` with what to do, or `_OutOfReach` where a copy in the cache may help."""
+    from huggingface_hub import errors
+
+    if os.environ.get("HF_HUB_OFFLINE", "").upper() in {"1", "ON", "YES", "TRUE"}:
+        raise _OutOfReach("HF_HUB_OFFLINE is set")
+    try:
+        yield
+    except errors.GatedRepoError:
+        raise HubError(
+            f"'{repository}' asks its readers to accept terms. Do so at {_host()}/datasets/{repository}, then run "
+            "`hf auth login`."
+        ) from None
+    except errors.RepositoryNotFoundError:
+        raise HubError(
+            f"The Hub ({_host()}) shows no data set '{repository}'. "
+            "Check the name; if it is private, run `hf auth login`."
+        ) from None
+    except errors.RevisionNotFoundError:
+        raise HubError(
+            f"'{repository}' has no revision '{revision or 'main'}' on the Hub ({_host()}). Give a branch, a tag or a "
+            f"commit that it has, or leave @revision out."
+        ) from None
+    except errors.HfHubHTTPError as error:
+        status = error.response.status_code
+        if status >= 500 or status in (408, 429):
+            raise _OutOfReach(f"it answered {status}") from None
+        raise HubError(
+            f"The Hub ({_host()}) refused '{repository}' with status {status}. Run `hf auth login`."
+        ) from None
+    except (errors.OfflineModeIsEnabled, errors.IncompleteSnapshotError, errors.LocalEntryNotFoundError) as error:
+        raise _OutOfReach(type(error).__name__) from None
+    except (errors.HTTPError, errors.FileMetadataError, errors.XetDownloadError) as error:
+        raise _OutOfReach(type(error).__name__) from None
+    except OSError as error:
+        raise HubError(
+            f"'{repository}' cannot be kept in {_cache_folder()}: {error.strerror or type(error).__name__}. "
+            "Make room, or set HF_HOME to another folder."
+        ) from None
+
+
+def _endpoint() -> str:
+    """The Hub's address, read when it is needed."""
+    return (os.environ.get("HF_ENDPOINT") or "https://huggingface.co").rstrip("/")
+
+
+def _host() -> str:
+    """The address as it may be shown: without a user's name or password."""
+    parts = urlsplit(_endpoint())
+    port = f":{parts.port}" if parts.port else ""
+    return f"{parts.scheme}://{parts.hostname}{port}"
+
+
+def _cache_folder() -> Path:
+    """Where `huggingface_hub` keeps its copies, by the environment as it is now."""
+    if named := os.environ.get("HF_HUB_CACHE"):
+        return Path(named).expanduser()
+    home = os.environ.get("HF_HOME") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "huggingface"
+    return Path(home).expanduser() / "hub"

@@ -1,0 +1,172 @@
+"""The page's sentences: what was measured, on what, how, and how to make it again.
+
+What belongs here: wording, from the table's own fields. What does not: HTML, and any claim that the table does not
+carry.
+"""
+
+import shlex
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.sinks.words import common_unit, is_number, plural, show
+
+Table = Mapping[str, Any]
+WHOLE_CHUNK = (
+    "The mean over all steps of the chunk. Longer chunks look further, so never compare it across chunk sizes."
+)
+
+
+def facts(table: Table) -> list[list[str]]:
+    """Two lines under the title, in parts: the data; the settings that the numbers depend on."""
+    data, folds = table["dataset"], table["split"]["folds"]
+    units = ", ".join(dict.fromkeys(unit or "unit unknown" for unit in data["action_units"]))
+    kinds = ", ".join(dict.fromkeys(data["action_kinds"]))
+    held_out = len({episode for fold in folds for episode in fold["test"]})
+    lines = [
+        [
+            plural(data["episodes"], "episode"), plural(data["frames"], "frame"), f"{data['fps']:g} fps",
+            f"{plural(len(data['action_names']), 'action column')} ({kinds}; {units})",
+            f"revision {data['revision'][:12]}" if data["revision"] else "no revision",
+            f"content {data['content_hash'][:12]}",
+        ],
+        [
+            f"protocol {table['protocol']}", f"budget {budget_words(table)}", plural(len(folds), "fold"),
+            f"{plural(held_out, 'episode')} held out", f"split {table['split']['hash'][:12]}",
+        ],
+    ]  # fmt: skip
+    return lines
+
+
+def budget_words(table: Table) -> str:
+    """`quick (5 seeds × 600 steps)`"""
+    budget = table["budget"]
+    steps = f"{plural(budget['seeds'], 'seed')} × {plural(budget['steps'], 'step')}"
+    return f"{budget['name']} ({steps})" if budget["name"] else steps
+
+
+def notes(table: Table) -> list[str]:
+    """What stands directly under the table: whatever a reader could take wrongly without it."""
+    found = []
+    intervals = [row for row in table["policies"] if (row.get("interval") or {}).get("first_step_mae")]
+    if intervals:
+        found.append("The small pictures share one axis from zero; what does not fit on it lies to the right.")
+    else:
+        found.append("No intervals: they need at least five held-out episodes.")
+    unit = common_unit(table["dataset"]["action_units"])
+    if unit is None:
+        found.append("The data set does not state the unit of its actions.")
+    if unit == "mixed units":
+        found.append(
+            "Action columns have different units, so read “scaled”; a mean over them in raw numbers says little."
+        )
+    if not any(row["rollouts"] for row in table["policies"]):
+        found.append("Closed loop: no simulator for this data set.")
+    found.append(
+        "This page tests no differences between policies; overlapping intervals mean that the order may be chance."
+    )
+    radius = table["floor"].get("radius")
+    if radius and is_number(radius["mean"]):
+        found.append(_floor_words(radius))
+    return found
+
+
+def _floor_words(radius: Mapping[str, Any]) -> str:
+    unit = f" {radius['unit']}" if radius.get("unit") else ""
+    return (
+        f"Radius floor on {radius.get('observations', 'the state')}, as the notebook takes it (biased, kept for "
+        f"comparison): mean distance {show(radius['mean'])}{unit}, 90th percentile {show(radius['p90'])}{unit}, "
+        f"{plural(radius['probes'], 'probe')}, median group {show(radius['median_neighbours'], 0)} frames. It is an "
+        "L2 distance: no bound on a mean absolute error."
+    )
+
+
+def numbers(table: Table, history: int) -> dict[str, str]:
+    """How each number was made, under the protocol that made it."""
+    protocol = _notebook if table["protocol"] == "notebook" else _strict
+    return protocol(table, history) | _common(table)
+
+
+def _strict(table: Table, history: int) -> dict[str, str]:
+    second = round(table["dataset"]["fps"])
+    return {
+        "Held-out frames": (
+            f"Whole episodes are held out. Every frame with {plural(history, 'frame')} of history is an anchor; all "
+            "policies answer at the same ones. Steps past the end of an episode count nowhere."
+        ),
+        "First-step MAE": (
+            "|predicted − recorded| of the action at the anchor's own frame, averaged over action columns, over the "
+            "anchors of an episode, over held-out episodes (each counts once) and over seeds. Angles are compared "
+            "around the circle."
+        ),
+        "95 % interval": (
+            "A t interval over held-out episodes, for these seeds and this training set; none below five episodes. "
+            "It says nothing about other training sets. With several folds it is conditional on them."
+        ),
+        "RMSE": "The root of the mean over episodes of the squared first-step error, averaged over action columns.",
+        "At one second": f"The same error {plural(second, 'step')} ahead; empty where a chunk is shorter.",
+        "Whole chunk": WHOLE_CHUNK,
+        "Normalising": "Means and deviations come from training episodes only.",
+    }
+
+
+def _notebook(table: Table, history: int) -> dict[str, str]:
+    second = round(table["dataset"]["fps"])
+    return {
+        "Protocol": (
+            "“notebook” reproduces published numbers and shares their weaknesses: normalisation has seen the "
+            "held-out episodes, each chunk size is scored on its own windows, and frames rather than episodes are "
+            "averaged. The default is “strict”."
+        ),
+        "First-step MAE": (
+            "|predicted − recorded| of the first action, averaged over action columns, over held-out windows and "
+            "over seeds."
+        ),
+        "95 % interval": "A t interval over held-out episodes of the mean over windows; none below five episodes.",
+        "RMSE": "The root of the mean squared first-step error, averaged over action columns.",
+        "At one second": f"The same error {plural(second, 'step')} ahead; empty where a chunk is shorter.",
+        "Whole chunk": WHOLE_CHUNK,
+    }
+
+
+def _common(table: Table) -> dict[str, str]:
+    entries = {
+        "× hold-still": (
+            "Hold-still's first-step error over the policy's: 2 means half the error. Hold-still repeats the state "
+            "(positions), or zero (velocities, differences), or else the previous action."
+        ),
+        "Scaled": "Error over the training actions' standard deviation, averaged over columns that move.",
+    }
+    trials = max((row["rollouts"]["n"] for row in table["policies"] if row["rollouts"]), default=0)
+    if trials:
+        entries["Success and score"] = (
+            f"One trained network (seed 0 of fold 0) from {trials} numbered start states; interval by Clopper and "
+            "Pearson. The score is the mean over start states of the best reward of the episode, from 0 to 1."
+        )
+    entries["Cost"] = (
+        "Parameters of one network; training seconds of all seeds and folds together; latency of one call, median."
+    )
+    return entries
+
+
+def identity(table: Table, version: str, made_at: str) -> dict[str, str]:
+    """Every hash in full, and what made the page."""
+    data = table["dataset"]
+    entries = {
+        "Data set": data["name"],
+        "Revision": data["revision"] or "none (not from the Hub)",
+        "Content hash": data["content_hash"],
+        "Split hash": table["split"]["hash"],
+        "Made by": f"demobench {version}",
+    }
+    return entries | ({"Made at": made_at} if made_at else {})
+
+
+def files(table: Table) -> dict[str, str]:
+    """How to open what was written beside the page."""
+    commands = {
+        "rerun": ("Held-out episodes, recorded against predicted", lambda at: f"rerun {shlex.quote(at)}"),
+        "mcap": ("The same as ROS 2 messages", lambda at: f"{at}  (Foxglove, PlotJuggler, rosbags)"),
+        "mlflow": ("Metrics and models", lambda at: f"{at}  (demobench ui)"),
+    }
+    found = {key: table["artifacts"].get(key) for key in commands}
+    return {commands[key][0]: commands[key][1](str(at)) for key, at in found.items() if at}

@@ -1,0 +1,222 @@
+"""The page's looks: style sheet, colours as CSS variables, and the script that draws the charts.
+
+What belongs here: CSS and JavaScript. What does not: content. Colours are variables of which the reader's setting
+(light or dark) or paper picks one value; charts are SVG that refers to them, so nothing is drawn again when it changes.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+from pipeline.sinks.markup import Html, json_for_script, script_text
+from pipeline.sinks.palette import CONFIG, FAILURE, GRID, INK, MUTED, Colour, all_colours, policy_colours
+
+PAGE = Colour("#ffffff", "#14171b")
+
+
+def variable(colour: Colour) -> str:
+    """The CSS variable of a colour, named after its value on light ground."""
+    return f"--c{colour.light[1:]}"
+
+
+def themed(spec: Any) -> Any:
+    """A chart's definition with every colour replaced by its CSS variable. Data is left alone."""
+    swaps = {colour.light: f"var({variable(colour)})" for colour in all_colours()}
+    return _swap(spec, swaps)
+
+
+def _swap(value: Any, swaps: dict[str, str]) -> Any:
+    if isinstance(value, dict):
+        kept = ("datasets", "data", "$schema")
+        return {key: item if key in kept else _swap(item, swaps) for key, item in value.items() if key != "$schema"}
+    if isinstance(value, list):
+        return [_swap(item, swaps) for item in value]
+    return swaps.get(value, value) if isinstance(value, str) else value
+
+
+def _colour_rules(policies: Iterable[str]) -> list[str]:
+    def block(theme: str) -> str:
+        return "".join(f"{variable(colour)}:{getattr(colour, theme)};" for colour in (*all_colours(), PAGE))
+
+    rules = [
+        f":root{{{block('light')}}}",
+        f"@media screen and (prefers-color-scheme:dark){{:root{{{block('dark')}}}}}",
+    ]
+    for policy, colour in policy_colours(policies).items():
+        rules.append(f'[data-policy="{_css_string(policy)}"]{{--policy:var({variable(colour)})}}')
+    return rules
+
+
+def _css_string(text: str) -> str:
+    """Text inside a quoted CSS string: all but ASCII letters, digits, `_` and `-` are written as their numbers."""
+    return "".join(c if c.isascii() and (c.isalnum() or c in "_-") else f"\\{ord(c):x} " for c in text)
+
+
+STYLE = """
+:root {
+  color-scheme: light dark;
+  --ink: var(INK); --muted: var(MUTED); --line: var(GRID); --page: var(PAGE);
+  --soft: color-mix(in srgb, var(INK) 4%, var(PAGE));
+}
+* { box-sizing: border-box; }
+body {
+  margin: 0; background: var(--page); color: var(--ink); -webkit-text-size-adjust: 100%;
+  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif;
+}
+main { max-width: 1340px; margin: 0 auto; padding: 40px 24px 72px; }
+h1 { margin: 2px 0 10px; font-size: 34px; line-height: 1.15; letter-spacing: -.015em; overflow-wrap: anywhere; }
+h2 { margin: 0 0 6px; font-size: 20px; line-height: 1.3; letter-spacing: -.005em; }
+h3 { margin: 24px 0 4px; font-size: 16px; }
+section { margin-top: 44px; }
+section > p, .short { max-width: 78ch; }
+.brand { margin: 0; color: var(--muted); font-size: 13px; letter-spacing: .08em; text-transform: uppercase; }
+.facts { margin: 2px 0; color: var(--muted); font-size: 14px; }
+.facts span { display: inline-block; }
+.short { margin: 26px 0 -18px; font-size: 18px; }
+
+.scroll { overflow-x: auto; border-block: 1px solid var(--line); }
+.scroll:focus-visible, summary:focus-visible { outline: 2px solid var(--ink); outline-offset: 2px; }
+table {
+  width: 100%; border-collapse: separate; border-spacing: 0; font-size: 13.5px; font-variant-numeric: tabular-nums;
+}
+caption {
+  position: sticky; left: 0; width: max-content; max-width: calc(100vw - 32px); padding: 8px 7px;
+  color: var(--muted); font-size: 13px; text-align: left;
+}
+th, td {
+  padding: 6px 7px; border-top: 1px solid var(--line);
+  font-weight: 400; text-align: right; vertical-align: top; white-space: nowrap;
+}
+thead th { font-weight: 600; vertical-align: bottom; font-size: 13px; line-height: 1.3; }
+td small, th small { display: block; color: var(--muted); font-size: 12px; font-weight: 400; line-height: 1.35; }
+td small.beside { display: inline; }
+td b { font-weight: inherit; }
+td.best, td.best b { font-weight: 700; }
+td.none { color: var(--muted); }
+.left, .name { text-align: left; }
+.name { position: sticky; left: 0; z-index: 1; background: var(--page); }
+tbody th.name small { display: none; padding-left: 19px; }
+tbody tr:hover > * { background: var(--soft); }
+tr.baseline .name, tr.baseline td { color: var(--muted); }
+.swatch {
+  display: inline-block; width: 11px; height: 11px; margin-right: 8px; border-radius: 3px; background: var(--policy);
+}
+tr.baseline .swatch { border-radius: 50%; }
+.range {
+  display: block; position: relative; width: 138px; height: 9px; margin: 3px 0 1px auto;
+  border-left: 1px solid var(--line);
+  background: linear-gradient(var(--line), var(--line)) 0 4px / 100% 1px no-repeat;
+}
+.range i { position: absolute; }
+.whisker { top: 3px; height: 3px; min-width: 1px; border-radius: 2px; background: var(--policy); }
+.dot { top: 0; width: 9px; height: 9px; margin-left: -4.5px; border-radius: 50%; background: var(--policy); }
+.beyond { top: 0; margin-left: -4px; border: 4.5px solid transparent; border-left: 7px solid var(--policy); }
+.notes { max-width: 96ch; margin: 12px 0 18px; padding-left: 20px; color: var(--muted); font-size: 14px; }
+details { margin-top: 14px; }
+details .scroll { margin-top: 8px; }
+summary { padding: 4px 0; font-size: 15px; cursor: pointer; }
+aside { margin-top: 36px; padding: 14px 20px; border-left: 3px solid var(FAILURE); background: var(--soft); }
+aside h2 { font-size: 16px; }
+aside ul { margin: 6px 0; padding-left: 20px; font-size: 15px; overflow-wrap: anywhere; }
+
+.figures { display: grid; gap: 48px 44px; grid-template-columns: repeat(2, minmax(0, 1fr)); margin-top: 48px; }
+.figures section { margin: 0; }
+.figures .wide { grid-column: 1 / -1; }
+.card > p { margin: 0 0 14px; color: var(--muted); font-size: 15px; }
+.panels { display: grid; gap: 22px 34px; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); }
+.panels:has(.square) { grid-template-columns: repeat(auto-fill, minmax(min(100%, 250px), 1fr)); }
+.wide .panels:has(.square) { grid-template-columns: repeat(auto-fill, minmax(min(100%, 330px), 1fr)); }
+figure { min-width: 0; margin: 0; break-inside: avoid; }
+figure:only-child { max-width: 720px; }
+figcaption { margin-bottom: 4px; font-size: 14px; font-weight: 600; overflow-wrap: anywhere; }
+.chart { width: 100%; min-height: 60px; }
+.chart svg { max-width: 100%; height: auto; overflow: visible; }
+.chart.failed { color: var(--muted); font-size: 14px; }
+#vg-tooltip-element {
+  position: fixed; z-index: 9; visibility: hidden; padding: 7px 10px; border: 1px solid var(--line);
+  border-radius: 6px; background: var(--page); box-shadow: 0 2px 10px rgb(0 0 0 / .18); font-size: 13px;
+}
+#vg-tooltip-element.visible { visibility: visible; }
+#vg-tooltip-element td { padding: 1px 4px; border: 0; text-align: left; }
+#vg-tooltip-element .key { color: var(--muted); }
+
+dl {
+  display: grid; gap: 10px 40px; grid-template-columns: repeat(auto-fit, minmax(min(100%, 440px), 1fr));
+  margin: 10px 0 0; font-size: 15px;
+}
+dt { font-weight: 600; }
+dd { margin: 0; color: var(--muted); overflow-wrap: anywhere; }
+pre {
+  padding: 12px 16px; border: 1px solid var(--line); border-radius: 6px; background: var(--soft); overflow-x: auto;
+}
+code { font: 14px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace; }
+
+@media (max-width: 900px) {
+  .figures { display: block; }
+  .figures section { margin-top: 40px; }
+}
+@media (max-width: 600px) {
+  main { padding: 22px 16px 48px; }
+  h1 { font-size: 27px; }
+  h2 { font-size: 18px; }
+  .short { font-size: 16px; }
+  .scroll { margin-inline: -16px; }
+  th, td { padding: 7px 8px; }
+  .name { padding-left: 16px; box-shadow: 1px 0 0 var(--line); }
+  .left { display: none; }
+  tbody th.name small { display: block; }
+  .range { width: 104px; }
+}
+@media print {
+  @page { size: A4 landscape; margin: 12mm; }
+  * { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+  body { font-size: 10.5pt; }
+  main { max-width: none; padding: 0; }
+  section { margin-top: 24px; }
+  .short { margin: 16px 0 0; }
+  .scroll { overflow: visible; }
+  table { font-size: 8pt; }
+  thead th, td small, th small { font-size: 7pt; }
+  th, td { padding: 3px 5px; }
+  .range { width: 96px; }
+  .card { break-inside: avoid; }
+}
+"""
+
+DRAW = """
+"use strict";
+const charts = JSON.parse(document.getElementById("charts").textContent);
+const options = {
+  mode: "vega-lite", renderer: "svg", actions: false, defaultStyle: false, ast: true, config: CONFIG,
+  tooltip: {disableDefaultStyle: true},
+};
+if (document.body.clientWidth < 520) options.config.legend.columns = 2;
+function fitted(spec, width) {
+  if (spec.usermeta && spec.usermeta.square) {
+    const side = Math.max(160, Math.min(spec.width, width - 76));
+    return {...spec, width: side, height: side};
+  }
+  return {...spec, width: "container", autosize: {type: "fit-x", contains: "padding"}};
+}
+for (const place of document.querySelectorAll("[data-chart]")) {
+  const spec = charts[Number(place.dataset.chart)];
+  vegaEmbed(place, fitted(spec, place.clientWidth), options).catch((error) => {
+    place.classList.add("failed");
+    place.textContent = "This picture could not be drawn: " + error.message;
+  });
+}
+"""
+"""Draws every chart into its place. Expressions run in Vega's interpreter (`ast`), since the page allows no `eval`."""
+
+
+def style_sheet(policies: Iterable[str]) -> Html:
+    """The page's whole style: looks, the variables for light, dark and paper, and a rule for each policy's colour."""
+    rules = STYLE
+    for name, colour in {"INK": INK, "MUTED": MUTED, "GRID": GRID, "PAGE": PAGE, "FAILURE": FAILURE}.items():
+        rules = rules.replace(f"var({name})", f"var({variable(colour)})")
+    return Html("\n".join([rules, *_colour_rules(policies)]))
+
+
+def draw_script() -> Html:
+    """The script that draws the charts in the page's colours."""
+    config = themed(CONFIG) | {"background": "transparent"}
+    return script_text(DRAW.replace("CONFIG", json_for_script(config)))

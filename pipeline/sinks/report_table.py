@@ -1,0 +1,174 @@
+"""The page's table: one row a policy × observation set, and the first-step error by action column below it.
+
+What belongs here: columns, cells and their wording. What does not: the rest of the page (`report`), any arithmetic
+beyond finding a column's best value.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pipeline.sinks.markup import Html, element, join
+from pipeline.sinks.palette import is_baseline
+from pipeline.sinks.words import DASH, common_unit, decimals_for, is_number, show, show_interval
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of numbers: its heading, what stands below it, a row's value, and which end is better, if either."""
+
+    title: str
+    below: str
+    value: Callable[[Row], Any]
+    better: Literal["low", "high"] | None = None
+    cell: Callable[[Row, str], Html | str] | None = None
+    decimals: int | None = None
+
+
+def benchmark_table(table: Mapping[str, Any]) -> Html:
+    """The table of one object of `run --json`; closed-loop columns only where something was rolled out."""
+    rows = table["policies"]
+    columns = _columns(table)
+    heads = [_head("Policy", "", class_="name"), _head("Observations", "", class_="left")]
+    heads += [_head(column.title, column.below) for column in columns]
+    decimals = [
+        decimals_for([column.value(row) for row in rows]) if column.decimals is None else column.decimals
+        for column in columns
+    ]
+    bests = [_best(column, rows) for column in columns]
+    body = []
+    for row in rows:
+        cells = [_name_cell(row), element("td", row["observations"], class_="left")]
+        for column, places, best in zip(columns, decimals, bests, strict=True):
+            cells.append(_cell(column, row, places, best))
+        body.append(element("tr", cells, class_="baseline" if is_baseline(row["policy"]) else None))
+    caption = "Policies, lowest first-step error on top. Bold: the best value of its column."
+    inner = element(
+        "table", element("caption", caption), element("thead", element("tr", heads)), element("tbody", body)
+    )
+    return element("div", inner, class_="scroll", tabindex="0", role="region", aria_label="Benchmark table")
+
+
+def _name_cell(row: Row) -> Html:
+    """A policy with its colour; narrow screens show the observation set here and hide that column."""
+    swatch = element("span", class_="swatch", data_policy=row["policy"], aria_hidden="true")
+    return element("th", swatch, row["policy"], element("small", row["observations"]), class_="name", scope="row")
+
+
+def _columns(table: Mapping[str, Any]) -> list[Column]:
+    unit = common_unit(table["dataset"]["action_units"]) or ""
+    scale = _scale(table["policies"])
+    columns = [
+        Column(
+            "First-step MAE", _and(unit, "95 % interval"), lambda row: row["first_step_mae"], "low",
+            lambda row, shown: _with_interval(row, shown, scale),
+        ),
+        Column("RMSE", unit, lambda row: row["first_step_rmse"], "low"),
+        Column("At 1 s", _and("MAE", unit), lambda row: row["at_one_second_mae"], "low"),
+        Column("Whole chunk", _and("MAE", unit), lambda row: row["whole_chunk_mae"]),
+        Column("× hold-still", "ratio", lambda row: row["vs_hold_still"], "high", None, 2),
+        Column("Scaled", "deviations", lambda row: row["scaled"], "low"),
+    ]  # fmt: skip
+    if any(row["rollouts"] for row in table["policies"]):
+        columns += [
+            Column("Success", "95 % interval", lambda row: _of(row, "success"), "high", _success),
+            Column("Score", "best reward", lambda row: _of(row, "score"), "high", None, 3),
+        ]
+    return [
+        *columns,
+        Column("Params", "one net", lambda row: row["params"], None, lambda row, _: _count(row["params"])),
+        Column("Training", "s", lambda row: row["train_s"], None, lambda row, _: _seconds(row["train_s"])),
+        Column("Latency", "ms a call", lambda row: row["latency_ms"], decimals=2),
+    ]
+
+
+def _and(*words: str) -> str:
+    return ", ".join(word for word in words if word)
+
+
+def _head(title: str, below: str, class_: str | None = None) -> Html:
+    return element("th", title, element("small", below) if below else None, class_=class_, scope="col")
+
+
+def _best(column: Column, rows: Sequence[Row]) -> Any:
+    values = [value for row in rows if is_number(value := column.value(row))]
+    if column.better is None or len(values) < 2:
+        return None
+    return min(values) if column.better == "low" else max(values)
+
+
+def _cell(column: Column, row: Row, decimals: int, best: Any) -> Html:
+    value = column.value(row)
+    shown = show(value, decimals)
+    content = column.cell(row, shown) if column.cell and is_number(value) else shown
+    if best is not None and value == best:
+        return element("td", content, class_="best")
+    return element("td", content, class_=None if is_number(value) else "none")
+
+
+def _of(row: Row, key: str) -> float | None:
+    return row["rollouts"].get(key) if row["rollouts"] else None
+
+
+def _scale(rows: Sequence[Row]) -> float:
+    """The error at the right end of the small interval pictures: a little above hold-still or what beats it."""
+    errors = [row["first_step_mae"] for row in rows if is_number(row["first_step_mae"])]
+    still = [
+        row["first_step_mae"] for row in rows if row["policy"] == "hold_still" and is_number(row["first_step_mae"])
+    ]
+    if not errors:
+        return 1.0
+    return 1.25 * (still[0] if still else sorted(errors)[len(errors) // 2]) or 1.0
+
+
+def _with_interval(row: Row, shown: str, scale: float) -> Html:
+    """The error, its interval, and both as a small picture on an axis from zero that all rows share."""
+    interval = (row.get("interval") or {}).get("first_step_mae")
+    decimals = len(shown.partition(".")[2])
+    text = show_interval(interval, decimals)
+    low, high = interval if text else (row["first_step_mae"],) * 2
+    left, right, at = (100 * min(max(v / scale, 0.0), 1.0) for v in (low, high, row["first_step_mae"]))
+    marks = [
+        element("i", class_="whisker", style=f"left:{left:.1f}%;width:{right - left:.1f}%"),
+        element("i", class_="dot" if row["first_step_mae"] <= scale else "beyond", style=f"left:{at:.1f}%"),
+    ]
+    picture = element("span", marks, class_="range", data_policy=row["policy"], aria_hidden="true")
+    return join(element("b", shown), " ", element("small", text, class_="beside") if text else None, picture)
+
+
+def _success(row: Row, _: str) -> Html:
+    rollouts = row["rollouts"]
+    done = round(rollouts["success"] * rollouts["n"])
+    interval = rollouts.get("success_interval")
+    text = f"{100 * interval[0]:.0f}–{100 * interval[1]:.0f} %" if show_interval(interval) else ""
+    return join(element("b", f"{done}/{rollouts['n']}"), element("small", text))
+
+
+def _count(value: float) -> str:
+    return f"{value:,}" if value else DASH
+
+
+def _seconds(value: float) -> str:
+    return (f"{value:,.0f}" if value >= 10 else f"{value:.1f}") if value else DASH
+
+
+def column_table(table: Mapping[str, Any]) -> Html | None:
+    """First-step error of every action column, in its own unit; None where there is only one column."""
+    data, rows = table["dataset"], table["policies"]
+    names, units = data["action_names"], data["action_units"]
+    if len(names) < 2:
+        return None
+    heads = [_head("Policy", "", class_="name"), _head("Observations", "", class_="left")]
+    heads += [_head(name, unit or "") for name, unit in zip(names, units, strict=True)]
+    decimals = [decimals_for([row["error_by_joint"].get(name) for row in rows]) for name in names]
+    body = []
+    for row in rows:
+        errors = [show(row["error_by_joint"].get(name), places) for name, places in zip(names, decimals, strict=True)]
+        cells = [_name_cell(row), element("td", row["observations"], class_="left")]
+        cells += [element("td", error) for error in errors]
+        body.append(element("tr", cells))
+    inner = element("table", element("thead", element("tr", heads)), element("tbody", body))
+    scroll = element("div", inner, class_="scroll", tabindex="0", role="region", aria_label="Error by action column")
+    return element("details", element("summary", "First-step MAE of each action column"), scroll)

@@ -1,0 +1,252 @@
+"""The head-to-head table, as JSON and as text.
+
+What belongs here: putting facts, scores, floors and roll-outs into the shape that `demobench run --json` promises, and
+drawing it. What does not: working any of them out.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.experiment import Experiment
+from pipeline.types import RadiusFloor, Split
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+METRICS = (
+    "first_step_mae", "first_step_rmse", "first_step_l2", "at_one_second_mae", "at_one_second_rmse",
+    "whole_chunk_mae", "whole_chunk_rmse", "ensembled_first_step_mae", "error_by_horizon", "rmse_by_horizon",
+    "hold_still_by_horizon", "error_by_joint", "vs_hold_still", "scaled", "scaled_by_joint", "interval",
+)  # fmt: skip
+"""What a row takes over from a policy's score."""
+
+
+def build_table(
+    facts: Mapping[str, Any],
+    experiment: Experiment,
+    split: Split,
+    floors: Sequence[RadiusFloor],
+    entries: Iterable[Mapping[str, Any]],
+) -> dict[str, Any]:
+    """The table of one data set.
+
+    Parameters
+    ----------
+    facts : what `quality.inspect_dataset` found.
+    entries : one a row: `variant`, `observations`, `metrics` (`metrics.Score.metrics`), `windows_train`,
+        `windows_test`, `latency_ms`, `parameters`, `train_s` and `rollouts` (a summary or None).
+
+    Returns
+    -------
+    dict : JSON-able; rows in the order of their first-step error. A number that is not finite is None.
+    """
+    rows = [_row(entry, experiment) for entry in entries]
+    rows.sort(key=_best_first)
+    table = {
+        "dataset": dataset_json(facts),
+        "protocol": experiment.protocol,
+        "budget": {"name": experiment.budget, "steps": experiment.steps, "seeds": experiment.seeds},
+        "split": {
+            "hash": split.hash,
+            "folds": [{"train": list(fold.train), "test": list(fold.test)} for fold in split.folds],
+        },
+        "floor": floor_json(floors),
+        "brackets": [],
+        "policies": rows,
+        "artifacts": {"report": None, "mcap": None, "rerun": None, "mlflow": None},
+    }
+    return json_safe(table)
+
+
+def dataset_json(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """The `dataset` object of every command's JSON."""
+    keys = (
+        "name", "revision", "content_hash", "episodes", "frames", "fps", "action_names", "action_units", "action_kinds",
+        "tracking_lag",
+    )  # fmt: skip
+    return json_safe({key: facts[key] for key in keys})
+
+
+def floor_json(floors: Sequence[RadiusFloor]) -> dict[str, Any]:
+    """The `floor` object: the notebook's estimate of the first observation set, then all estimates."""
+    radius = None
+    if floors:
+        first = floors[0]
+        radius = {
+            "probes": first.probes, "median_neighbours": first.median_neighbours, "mean": first.mean, "p90": first.p90,
+            "observations": first.observations, "radius": first.radius, "scaled": first.scaled, "unit": first.unit,
+        }  # fmt: skip
+    estimates = [
+        {
+            "observations": floor.observations, "horizon": floor.horizon, "loss": "l2", "estimator": "radius",
+            "value": floor.mean, "interval": None, "refused": floor.refused,
+        }
+        for floor in floors
+    ]  # fmt: skip
+    return json_safe({"radius": radius, "estimates": estimates})
+
+
+def _row(entry: Mapping[str, Any], experiment: Experiment) -> dict[str, Any]:
+    variant, metrics = entry["variant"], entry["metrics"]
+    return {
+        "policy": variant.name,
+        "method": variant.method,
+        "chunk": variant.chunk,
+        "observations": entry["observations"],
+        "seeds": experiment.seeds if variant.is_trained else 1,
+        "windows_train": entry["windows_train"],
+        "windows_test": entry["windows_test"],
+        **{metric: metrics[metric] for metric in METRICS},
+        "params": entry["parameters"],
+        "train_s": entry["train_s"],
+        "latency_ms": entry["latency_ms"],
+        "verdict": {"vs_hold_still": None, "vs_champion": None},
+        "rollouts": entry["rollouts"],
+    }
+
+
+def _best_first(row: Mapping[str, Any]) -> tuple:
+    error = row["first_step_mae"]
+    return np.inf if error is None else error, row["policy"], row["observations"]
+
+
+def json_safe(value: Any) -> Any:
+    """The same without numpy's types; numbers that are not finite become None."""
+    if isinstance(value, Mapping):
+        return {key: json_safe(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [json_safe(item) for item in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value
+
+
+def render_table(table: Mapping[str, Any], console: "Console") -> None:
+    """Draw the table, best first step on top, with what its numbers rest on below it."""
+    from rich.markup import escape
+
+    dataset = table["dataset"]
+    unit = _common_unit(dataset["action_units"])
+    console.print()
+    console.print(
+        f"[bold]{escape(dataset['name'])}[/]  {dataset['episodes']:,} episodes · {dataset['frames']:,} frames · "
+        f"{dataset['fps']:g} fps · {len(dataset['action_names'])} action columns ({_units_words(dataset)})",
+        soft_wrap=True,
+    )
+    console.print(_grid(table, unit))
+    for line in _footnotes(table):
+        console.print(line, style="dim", soft_wrap=True)
+    console.print()
+
+
+def _grid(table: Mapping[str, Any], unit: str | None):
+    from rich import box
+    from rich.table import Table
+
+    rows = table["policies"]
+    columns = [(head, show) for head, show, wanted in _columns(unit) if wanted is None or any(map(wanted, rows))]
+    grid = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    for head, _ in columns:
+        left = head in ("policy", "sees")
+        grid.add_column(head, justify="left" if left else "right", no_wrap=left, overflow="fold")
+    for row in rows:
+        trained = row["params"] > 0
+        grid.add_row(*(show(row) for _, show in columns), style=None if trained else "dim")
+    return grid
+
+
+def _columns(unit: str | None):
+    """(head, row → cell, row → whether the column is worth showing) from left to right."""
+    from rich.markup import escape
+
+    in_unit = f"\n{unit}" if unit else ""
+
+    def number(key):
+        return lambda row: _number(row[key])
+
+    def there(key):
+        return lambda row: row[key] is not None
+
+    return [
+        ("policy", lambda row: escape(row["policy"]), None),
+        ("sees", lambda row: escape(row["observations"]), None),
+        (f"first step\nMAE{in_unit}", _first_step, None),
+        (f"\nRMSE{in_unit}", number("first_step_rmse"), None),
+        (f"\nL2{in_unit}", number("first_step_l2"), lambda row: len(row["error_by_joint"]) == 2),
+        ("\n× hold-still", lambda row: _number(row["vs_hold_still"], 3), None),
+        ("\nscaled", lambda row: _number(row["scaled"], 3), lambda row: unit is None),
+        (f"at 1 s\nMAE{in_unit}", number("at_one_second_mae"), there("at_one_second_mae")),
+        (f"whole chunk\nMAE{in_unit}", number("whole_chunk_mae"), there("whole_chunk_mae")),
+        (f"ensembled\nMAE{in_unit}", number("ensembled_first_step_mae"), there("ensembled_first_step_mae")),
+        ("success", _success, there("rollouts")),
+        ("score", lambda row: _number(row["rollouts"] and row["rollouts"].get("score"), 3), there("rollouts")),
+        ("params", lambda row: f"{row['params']:,}" if row["params"] else "—", None),
+        ("trained\ns", lambda row: f"{row['train_s']:,.0f}" if row["train_s"] else "—", None),
+        ("call\nms", lambda row: _number(row["latency_ms"], 2), None),
+    ]
+
+
+def _number(value: float | None, digits: int = 4) -> str:
+    return "—" if value is None else f"{value:#.{digits}g}".rstrip(".")
+
+
+def _first_step(row: Mapping[str, Any]) -> str:
+    """The error and its interval."""
+    interval = row["interval"].get("first_step_mae")
+    value = f"[bold]{_number(row['first_step_mae'])}[/]"
+    return f"{value} [dim]{_number(interval[0], 3)}–{_number(interval[1], 3)}[/]" if interval else value
+
+
+def _success(row: Mapping[str, Any]) -> str:
+    rollouts = row["rollouts"]
+    if not rollouts:
+        return "—"
+    interval = rollouts.get("success_interval")
+    value = f"{100 * rollouts['success']:.0f} %"
+    return f"{value} [dim]{100 * interval[0]:.0f}–{100 * interval[1]:.0f}[/]" if interval else value
+
+
+def _common_unit(units: Sequence[str | None]) -> str | None:
+    return units[0] if units and len(set(units)) == 1 else None
+
+
+def _units_words(dataset: Mapping[str, Any]) -> str:
+    from rich.markup import escape
+
+    units = list(dict.fromkeys(unit or "unit not stated" for unit in dataset["action_units"]))
+    words = " and ".join(units)
+    return escape(words + (", MAE mixes them: see scaled" if len(units) > 1 else ""))
+
+
+def _footnotes(table: Mapping[str, Any]) -> list[str]:
+    budget, folds, dataset = table["budget"], table["split"]["folds"], table["dataset"]
+    name = f"{budget['name']}, " if budget["name"] else ""
+    held_out = sum(len(fold["test"]) for fold in folds)
+    split = f"{len(folds)} folds" if len(folds) > 1 else f"1 fold, {len(folds[0]['train'])} episodes train"
+    over = "episodes, each counts once" if table["protocol"] == "strict" else "frames"
+    has_interval = any(row["interval"].get("first_step_mae") for row in table["policies"])
+    interval = "interval: t over held-out episodes, 95 %" if has_interval else "no interval below 5 held-out episodes"
+    lines = [
+        f"protocol {table['protocol']} · budget {name}{budget['seeds']} seed{'s' * (budget['seeds'] != 1)} × "
+        f"{budget['steps']:,} steps · {split}, {held_out} held out",
+        f"mean over {over}, averaged over seeds · {interval} · × hold-still above 1 beats standing still",
+    ]
+    if any(row["rollouts"] for row in table["policies"]):
+        trials = max(row["rollouts"]["n"] for row in table["policies"] if row["rollouts"])
+        lines.append(f"success: {trials} start states, one network, Clopper–Pearson 95 % · score: mean best reward")
+    radius = table["floor"]["radius"]
+    if radius and radius["mean"] is not None:
+        unit = f" {radius['unit']}" if radius["unit"] else ""
+        lines.append(
+            f"floor by radius (the notebook's, biased), L2, '{radius['observations']}': "
+            f"mean {radius['mean']:.2f}{unit}, 90th percentile {radius['p90']:.2f}{unit}, {radius['probes']} probes"
+        )
+    if dataset.get("revision"):
+        lines.append(f"revision {dataset['revision'][:12]} · split {table['split']['hash'][:12]}")
+    return lines

@@ -1,0 +1,45 @@
+"""Runs started outside the UI: what the instance keeps of them."""
+
+import os
+import socket
+
+import dagster as dg
+import pytest
+
+from assets_defs.launch import HOST_TAG, PID_TAG, close_dead_runs, open_instance, run_benchmark
+
+
+def test_a_run_can_be_found_and_run_again_by_the_ui(finished):
+    with open_instance(finished.store.root) as instance:
+        run = instance.get_runs(limit=1)[0]
+        assert run.status == dg.DagsterRunStatus.SUCCESS
+        assert run.job_name == "benchmark"
+        assert run.tags["dagster/partition"] == "tiny"
+        assert run.remote_job_origin.location_name == "demobench"
+        assert run.remote_job_origin.repository_origin.repository_name == "__repository__"
+        assert instance.get_dynamic_partitions("datasets") == ["tiny"]
+
+
+def test_an_interrupted_run_ends_as_canceled(finished):
+    def stop(event: dg.DagsterEvent) -> None:
+        if event.event_type_value == "STEP_START":
+            raise KeyboardInterrupt
+
+    with open_instance(finished.store.root) as instance:
+        with pytest.raises(KeyboardInterrupt):
+            run_benchmark(instance, finished.defs(), "tiny", [dg.AssetKey(["episode_split"])], on_event=stop)
+        assert instance.get_runs(limit=1)[0].status == dg.DagsterRunStatus.CANCELED
+
+
+def test_runs_whose_process_is_gone_are_closed_and_others_left(finished):
+    with open_instance(finished.store.root) as instance:
+        job = finished.defs().resolve_job_def("benchmark")
+        runs = {}
+        for name, pid in (("dead", 2**22 + 1), ("alive", os.getpid())):
+            tags = {PID_TAG: str(pid), HOST_TAG: socket.gethostname(), "dagster/partition": "tiny"}
+            runs[name] = instance.create_run_for_job(job_def=job, tags=tags)
+            instance.report_run_starting(runs[name])
+        assert close_dead_runs(instance) == [runs["dead"].run_id]
+        assert instance.get_run_by_id(runs["dead"].run_id).status == dg.DagsterRunStatus.FAILURE
+        assert instance.get_run_by_id(runs["alive"].run_id).status == dg.DagsterRunStatus.STARTING
+        instance.report_run_failed(runs["alive"])
