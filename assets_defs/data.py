@@ -185,7 +185,8 @@ def windows(
     def cut(draft):
         from pipeline.folds import describe_windows
 
-        variants = [v for v in workbench.variants if not v.only_when_named]
+        longest = int(bench.demonstrations.lengths.max()) - bench.experiment.history + 1
+        variants = [v for v in workbench.variants if budget.asks_for(v) or (v.chunk or 1) <= longest]
         described = describe_windows(bench.demonstrations, bench.semantics, bench.split, bench.experiment, variants)
         (draft / "windows.json").write_text(json.dumps(described, indent=1))
         rows = described["windows"]

@@ -85,18 +85,19 @@ def run_benchmark(
     partition: str,
     assets: Sequence[dg.AssetKey],
     observations: Sequence[str] = (),
+    policies: Sequence[str] = (),
     on_event: Callable[[dg.DagsterEvent], None] | None = None,
 ) -> dg.DagsterRun:
     """Run the selected assets of one partition in this process; returns the finished run.
 
-    `on_event` sees every Dagster event as it happens. Ctrl-C ends the run as CANCELED and is raised again.
+    `observations` and `policies` are what was asked for, where that is not everything. `on_event` sees every Dagster event as it happens. Ctrl-C ends the run as CANCELED and is raised again.
     """
     instance.add_dynamic_partitions(str(PARTITIONS.name), [partition])
     selection = set(assets)
     job = defs.resolve_job_def(BENCHMARK).get_subset(asset_selection=selection)
     run_config = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
-    if observations:
-        run_config["resources"] = {"budget": {"config": {"observations": list(observations)}}}
+    asked = {"observations": list(observations), "policies": list(policies)}
+    run_config["resources"] = {"budget": {"config": {name: value for name, value in asked.items() if value}}}
     run = instance.create_run_for_job(
         job_def=job,
         run_config=run_config,

@@ -39,6 +39,21 @@ def _task(bench: Bench, variant: Variant, unit: Unit):
     )  # fmt: skip
 
 
+def _tracking(bench: Bench) -> str:
+    from pipeline.sinks.to_mlflow import tracking_uri
+
+    return tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root)
+
+
+def _mlflow_run(bench: Bench, task, trained: Unit) -> str:
+    """The MLflow run of a trained policy."""
+    from pipeline.sinks.to_mlflow import find_run
+
+    fingerprint = {"fingerprint": bench.plan.fingerprint(trained)}
+    run_id = bench.summary(trained)["mlflow_run_id"]
+    return find_run(_tracking(bench), run_id, experiment=bench.plan.key, task=task, tags=fingerprint)
+
+
 def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
     asset_key = dg.AssetKey([variant.name, "trained_policy"])
     method = "a baseline: nothing is trained" if not variant.is_trained else f"method `{variant.method}`"
@@ -91,12 +106,12 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
     if variant.is_trained:
         picture_losses(folds[0], variant.name, draft / "losses.png")
     run_id = to_mlflow.log_training(
-        to_mlflow.tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root),
+        _tracking(bench),
         experiment=bench.plan.key,
         task=task,
         trained=folds,
         weights=draft / "fold_0",
-        tags={"dagster_run_id": bench.run_id, "fingerprint": bench.plan.fingerprint(unit)},
+        tags={"fingerprint": bench.plan.fingerprint(unit)},
     )
     shutil.rmtree(unfinished, ignore_errors=True)
     return Outcome(
@@ -168,8 +183,8 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
     save_errors(score.errors, draft / "errors.safetensors")
     picture_horizons(score.metrics, variant.name, task.demos, draft / "error_by_horizon.png")
     to_mlflow.log_scores(
-        to_mlflow.tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root),
-        bench.summary(trained_unit)["mlflow_run_id"],
+        _tracking(bench),
+        _mlflow_run(bench, task, trained_unit),
         score.metrics,
         score.seed_metrics,
         artifacts=[draft / "error_by_horizon.png"],
@@ -221,11 +236,11 @@ def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
     from pipeline.sinks import to_mlflow
     from pipeline.statistics.success import summarise_rollouts
 
-    trained_unit = Unit(f"{variant.name}/trained_policy", unit.entry)
+    task, trained_unit = _task(bench, variant, unit), Unit(f"{variant.name}/trained_policy", unit.entry)
     name = f"{variant.name} {unit.entry} roll-outs"
     try:
         results = roll_out(
-            _task(bench, variant, unit),
+            task,
             bench.plan.folder(trained_unit),
             lambda done, total: bench.progress(name, done, total, "frames"),
         )
@@ -233,11 +248,7 @@ def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
         return Outcome({"rollouts": None, "why_not": str(why)}, {"sane": (True, str(why))})
     save_rollouts(results, draft)
     summary = summarise_rollouts(results)
-    to_mlflow.log_rollouts(
-        to_mlflow.tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root),
-        bench.summary(trained_unit)["mlflow_run_id"],
-        summary,
-    )
+    to_mlflow.log_rollouts(_tracking(bench), _mlflow_run(bench, task, trained_unit), summary)
     in_range = bool(((results.best_reward >= 0) & (results.best_reward <= 1)).all())
     agree = bool((results.best_reward[results.success] >= 1).all())
     words = f"{summary['successes']} of {summary['n']} succeeded, score {summary['score']:.3f}"

@@ -31,6 +31,11 @@ class Budget(dg.ConfigurableResource):
     seeds: int | None = None
     steps: int | None = None
     observations: list[str] = []
+    policies: list[str] = []
+
+    def asks_for(self, variant: Variant) -> bool:
+        """Whether the launch named this policy, or named none and it need not be named."""
+        return variant.name in self.policies if self.policies else not variant.only_when_named
 
 
 @dataclass(frozen=True)

@@ -137,7 +137,13 @@ def _materialise(target: Target, session: Session, stale: Sequence[Any]) -> None
                 progress.say(f"closed run {run_id[:8]}, whose process was gone")
             try:
                 run = run_benchmark(
-                    instance, defs, target.key, assets, target.observations, on_event=progress.on_event
+                    instance,
+                    defs,
+                    target.key,
+                    assets,
+                    target.observations,
+                    [v.name for v in target.selected],
+                    progress.on_event,
                 )
             except KeyboardInterrupt:
                 progress.stop()

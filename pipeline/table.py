@@ -4,7 +4,8 @@ What belongs here: putting facts, scores, floors and roll-outs into the shape th
 drawing it. What does not: working any of them out.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -139,56 +140,86 @@ def render_table(table: Mapping[str, Any], console: "Console") -> None:
         f"{dataset['fps']:g} fps · {len(dataset['action_names'])} action columns ({_units_words(dataset)})",
         soft_wrap=True,
     )
-    console.print(_grid(table, unit))
-    for line in _footnotes(table):
+    grid, left_out = _grid(table, unit, console)
+    console.print(grid)
+    narrow = [f"left out for want of width: {', '.join(left_out)} (all in --json)"] if left_out else []
+    for line in (*_footnotes(table), *narrow):
         console.print(line, style="dim", soft_wrap=True)
     console.print()
 
 
-def _grid(table: Mapping[str, Any], unit: str | None):
+@dataclass(frozen=True)
+class _Column:
+    """A column of the text table: its head, a cell of a row, and the order in which it gives way (0: never)."""
+
+    head: str
+    cell: Callable[[Mapping[str, Any]], str]
+    gives_way: int = 0
+
+
+def _grid(table: Mapping[str, Any], unit: str | None, console: "Console") -> tuple[Any, list[str]]:
+    """The table as wide as the console allows, and the heads of the columns that had to be left out."""
+    columns, left_out = _columns(table["policies"], unit), []
+    while True:
+        grid = _draw(table["policies"], columns)
+        expendable = [column for column in columns if column.gives_way]
+        if console.measure(grid, options=console.options.update(width=1000)).maximum <= console.width or not expendable:
+            return grid, left_out
+        least = min(expendable, key=lambda column: column.gives_way)
+        columns.remove(least)
+        left_out.append(" ".join(least.head.split()))
+
+
+def _draw(rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column]):
     from rich import box
     from rich.table import Table
 
-    rows = table["policies"]
-    columns = [(head, show) for head, show, wanted in _columns(unit) if wanted is None or any(map(wanted, rows))]
     grid = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
-    for head, _ in columns:
-        left = head in ("policy", "sees")
-        grid.add_column(head, justify="left" if left else "right", no_wrap=left, overflow="fold")
+    for column in columns:
+        grid.add_column(column.head, justify="left" if column.head in ("policy", "sees") else "right", no_wrap=True)
     for row in rows:
-        trained = row["params"] > 0
-        grid.add_row(*(show(row) for _, show in columns), style=None if trained else "dim")
+        grid.add_row(*(column.cell(row) for column in columns), style=None if row["params"] else "dim")
     return grid
 
 
-def _columns(unit: str | None):
-    """(head, row → cell, row → whether the column is worth showing) from left to right."""
+def _columns(rows: Sequence[Mapping[str, Any]], unit: str | None) -> list[_Column]:
+    """From left to right, those that have something to show."""
     from rich.markup import escape
 
     in_unit = f"\n{unit}" if unit else ""
 
-    def number(key):
-        return lambda row: _number(row[key])
+    def number(key: str, digits: int = 4) -> Callable[[Mapping[str, Any]], str]:
+        return lambda row: _number(row[key], digits)
 
-    def there(key):
-        return lambda row: row[key] is not None
+    def score(row: Mapping[str, Any]) -> str:
+        return _number(row["rollouts"] and row["rollouts"].get("score"), 3)
 
+    columns = [
+        _Column("policy", lambda row: escape(row["policy"])),
+        _Column("sees", lambda row: escape(row["observations"])),
+        _Column(f"first step\nMAE{in_unit}", _first_step),
+        _Column(f"\nRMSE{in_unit}", number("first_step_rmse"), 4),
+        _Column("\n× hold-still", number("vs_hold_still", 3)),
+    ]
+    if any(len(row["error_by_joint"]) == 2 for row in rows):
+        columns.insert(4, _Column(f"\nL2{in_unit}", number("first_step_l2"), 8))
+    if unit is None:
+        columns.append(_Column("\nscaled", number("scaled", 3), 5))
+    optional = [
+        ("at_one_second_mae", f"at 1 s\nMAE{in_unit}", 9),
+        ("whole_chunk_mae", f"whole chunk\nMAE{in_unit}", 7),
+        ("ensembled_first_step_mae", f"ensembled\nMAE{in_unit}", 6),
+    ]
+    columns += [
+        _Column(head, number(key), way) for key, head, way in optional if any(row[key] is not None for row in rows)
+    ]
+    if any(row["rollouts"] for row in rows):
+        columns += [_Column("success", _success), _Column("score", score, 10)]
     return [
-        ("policy", lambda row: escape(row["policy"]), None),
-        ("sees", lambda row: escape(row["observations"]), None),
-        (f"first step\nMAE{in_unit}", _first_step, None),
-        (f"\nRMSE{in_unit}", number("first_step_rmse"), None),
-        (f"\nL2{in_unit}", number("first_step_l2"), lambda row: len(row["error_by_joint"]) == 2),
-        ("\n× hold-still", lambda row: _number(row["vs_hold_still"], 3), None),
-        ("\nscaled", lambda row: _number(row["scaled"], 3), lambda row: unit is None),
-        (f"at 1 s\nMAE{in_unit}", number("at_one_second_mae"), there("at_one_second_mae")),
-        (f"whole chunk\nMAE{in_unit}", number("whole_chunk_mae"), there("whole_chunk_mae")),
-        (f"ensembled\nMAE{in_unit}", number("ensembled_first_step_mae"), there("ensembled_first_step_mae")),
-        ("success", _success, there("rollouts")),
-        ("score", lambda row: _number(row["rollouts"] and row["rollouts"].get("score"), 3), there("rollouts")),
-        ("params", lambda row: f"{row['params']:,}" if row["params"] else "—", None),
-        ("trained\ns", lambda row: f"{row['train_s']:,.0f}" if row["train_s"] else "—", None),
-        ("call\nms", lambda row: _number(row["latency_ms"], 2), None),
+        *columns,
+        _Column("params", lambda row: f"{row['params']:,}" if row["params"] else "—", 3),
+        _Column("trained\ns", lambda row: f"{row['train_s']:,.0f}" if row["params"] else "—", 1),
+        _Column("call\nms", number("latency_ms", 2), 2),
     ]
 
 

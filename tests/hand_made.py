@@ -1,4 +1,4 @@
-"""Demonstrations whose every number is known, made in memory. What does not belong here: data sets on disk (`makers`)."""
+"""Demonstrations whose every number is known, in memory. What does not belong here: data sets on disk (`makers`)."""
 
 from dataclasses import replace
 

@@ -72,5 +72,5 @@ def test_more_folds_than_episodes_are_refused():
 
 
 def test_one_episode_cannot_be_split():
-    with pytest.raises(NotApplicableError, match="1 episode. A benchmark needs two"):
+    with pytest.raises(NotApplicableError, match=r"1 episode\. A benchmark needs two"):
         make_split(walks(1), **STRICT)

@@ -10,7 +10,7 @@ import math
 import os
 import time
 from collections.abc import Callable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
-from pipeline.errors import PolicyError
+from pipeline.errors import PolicyError, StoreError
 from pipeline.policies import Curve, Plan
 from pipeline.policies.batched import Stack
 from pipeline.types import ACTION
@@ -106,9 +106,10 @@ def fit_stack(windows: Windows, recipe: Recipe, plan: Plan, dtype: torch.dtype =
 
     Raises
     ------
-    PolicyError : the loss is not finite any more.
+    PolicyError : the loss is not finite any more, or there is no such device.
+    StoreError : a checkpoint cannot be written.
     """
-    device = "cuda" if plan.device == "auto" and torch.cuda.is_available() else plan.device.replace("auto", "cpu")
+    device = _device(plan.device)
     with _threads(plan.threads):
         gather = Gather(windows, dtype, device)
         sizes = (windows.history * gather.inputs.shape[1], *recipe.hidden, windows.chunk * gather.actions.shape[1])
@@ -180,10 +181,15 @@ class _Training:
             "fingerprint": self.fingerprint, "done": self.done, "seconds": self.seconds, "steps": self.steps,
             "losses": self.losses,
         }  # fmt: skip
-        path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        save_file(tensors, temporary, metadata={"progress": json.dumps(progress)})
-        temporary.replace(path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_file(tensors, temporary, metadata={"progress": json.dumps(progress)})
+            temporary.replace(path)
+        except (OSError, SafetensorError) as error:
+            with suppress(OSError):
+                temporary.unlink()
+            raise StoreError(f"The checkpoint {path} cannot be written ({error}). Make room, then run again.") from None
 
     def resume(self, path: Path) -> None:
         """Go on from a checkpoint, if there is one of this very training; otherwise start anew."""
@@ -213,6 +219,12 @@ def _fingerprint(windows: Windows, recipe: Recipe, plan: Plan, dtype: torch.dtyp
         "threads": plan.threads, "device": device, "dtype": str(dtype), "torch": torch.__version__,
     }  # fmt: skip
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+
+
+def _device(asked: str) -> str:
+    if asked == "cuda" and not torch.cuda.is_available():
+        raise PolicyError('device = "cuda", but PyTorch finds no CUDA device here. Use device = "auto" or "cpu".')
+    return "cuda" if asked == "auto" and torch.cuda.is_available() else asked.replace("auto", "cpu")
 
 
 def _by_seed(losses: list[list[float]], seeds: tuple[int, ...]) -> np.ndarray:

@@ -151,7 +151,7 @@ def columns_over_time(
     names = list(series)
     colours = {"recorded": INK.light, "state": MUTED.light}
     policies = [what for what in names if what not in colours]
-    colours |= {what: colour.light for what, colour in policy_colours(list(everyone) or policies).items()}
+    colours |= {what: colour.light for what, colour in policy_colours([*everyone, *policies]).items()}
     legend = alt.Legend(symbolType="stroke", symbolSize=500)
     color = alt.Color("what:N", scale=alt.Scale(domain=names, range=[colours[what] for what in names]), legend=legend)
     return (

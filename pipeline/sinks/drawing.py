@@ -47,14 +47,14 @@ def inline(rows: Rows) -> alt.InlineData:
 def colour_by_policy(policies: Iterable[str], everyone: Iterable[str], **more: Any) -> alt.Color:
     """Colour by the field `policy`. `everyone` are all policies of the benchmark: they decide which colour each has."""
     names = list(policies)
-    colours = policy_colours(list(everyone) or names)
+    colours = policy_colours([*everyone, *names])
     scale = alt.Scale(domain=names, range=[colours[name].light for name in names])
     return alt.Color("policy:N", scale=scale, **more)
 
 
 def colour_of(policy: str, everyone: Iterable[str]) -> str:
     """The one colour of a policy, on light ground."""
-    return policy_colours(list(everyone) or [policy])[policy].light
+    return policy_colours([*everyone, policy])[policy].light
 
 
 def plane(

@@ -164,9 +164,12 @@ def identity(table: Table, version: str, made_at: str) -> dict[str, str]:
 def files(table: Table) -> dict[str, str]:
     """How to open what was written beside the page."""
     commands = {
-        "rerun": ("Held-out episodes, recorded against predicted", lambda at: f"rerun {shlex.quote(at)}"),
-        "mcap": ("The same as ROS 2 messages", lambda at: f"{at}  (Foxglove, PlotJuggler, rosbags)"),
-        "mlflow": ("Metrics and models", lambda at: f"{at}  (demobench ui)"),
+        "rerun": ("Held-out episodes in Rerun", lambda at: f"rerun --bind 127.0.0.1 {shlex.quote(at)}"),
+        "mcap": (
+            "Held-out episodes as ROS 2 messages",
+            lambda at: f"{at} (opens in Foxglove, PlotJuggler, Rerun, rosbags)",
+        ),
+        "mlflow": ("Metrics and models", lambda at: f"{at} (demobench ui)"),
     }
     found = {key: table["artifacts"].get(key) for key in commands}
     return {commands[key][0]: commands[key][1](str(at)) for key, at in found.items() if at}

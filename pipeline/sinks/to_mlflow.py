@@ -71,40 +71,13 @@ def log_training(
 
     Returns the run's id, under which scores and roll-outs are added later.
     """
-    from mlflow.entities import Param, RunTag
-
-    variant = task.variant
     with _client(uri) as client:
-        experiment_id = _experiment_id(client, uri, experiment)
-        name = f"{variant.name}/{task.observation_set.name}"
-        run_id = client.create_run(experiment_id, run_name=name).info.run_id
-        params = {
-            "policy": variant.name,
-            "method": variant.method,
-            "chunk": variant.chunk,
-            "observations": task.observation_set.name,
-            "features": ", ".join(task.observation_set.features),
-            "protocol": task.experiment.protocol,
-            "seeds": len(task.seeds),
-            "steps": task.experiment.steps if variant.is_trained else 0,
-            "folds": len(task.split.folds),
-            "history": task.experiment.history,
-            "parameters": trained[0].parameters,
-        }
-        about = {
-            "content_hash": task.demos.content_hash,
-            "split_hash": task.split.hash,
-            "revision": task.demos.revision or "",
-            "data_set": task.demos.name,
-            **tags,
-        }
-        client.log_batch(
-            run_id,
-            params=[Param(k, str(v)) for k, v in params.items()],
-            tags=[RunTag(f"demobench.{k}", v) for k, v in about.items()],
-        )
-        _send(client, run_id, {"train_s": [(0, sum(t.train_s for t in trained))]})
-        if variant.is_trained:
+        run_id = _open_run(client, uri, experiment, task, tags)
+        experiment_id = client.get_run(run_id).info.experiment_id
+        name = f"{task.variant.name}/{task.observation_set.name}"
+        costs = {"train_s": sum(t.train_s for t in trained), "parameters": trained[0].parameters}
+        _send(client, run_id, _series(costs))
+        if task.variant.is_trained:
             for seed_number, seed in enumerate(task.seeds):
                 losses = {
                     f"loss_fold_{fold}": list(zip(t.steps_logged, t.losses[seed_number], strict=True))
@@ -116,6 +89,56 @@ def log_training(
             _log_model(client, run_id, weights, task)
         client.set_terminated(run_id)
     return run_id
+
+
+def _open_run(client: Any, uri: str, experiment: str, task: PolicyTask, tags: Mapping[str, str]) -> str:
+    """A new run with the parameters and tags that people compare and search by."""
+    from mlflow.entities import Param, RunTag
+
+    variant = task.variant
+    name = f"{variant.name}/{task.observation_set.name}"
+    run_id = client.create_run(_experiment_id(client, uri, experiment), run_name=name).info.run_id
+    params = {
+        "policy": variant.name,
+        "method": variant.method,
+        "chunk": variant.chunk,
+        "observations": task.observation_set.name,
+        "features": ", ".join(task.observation_set.features),
+        "protocol": task.experiment.protocol,
+        "seeds": len(task.seeds),
+        "steps": task.experiment.steps if variant.is_trained else 0,
+        "folds": len(task.split.folds),
+        "history": task.experiment.history,
+    }
+    about = {
+        "content_hash": task.demos.content_hash,
+        "split_hash": task.split.hash,
+        "revision": task.demos.revision or "",
+        "data_set": task.demos.name,
+        **tags,
+    }
+    client.log_batch(
+        run_id,
+        params=[Param(k, str(v)) for k, v in params.items()],
+        tags=[RunTag(f"demobench.{k}", v) for k, v in about.items()],
+    )
+    return run_id
+
+
+def find_run(uri: str, run_id: str, *, experiment: str, task: PolicyTask, tags: Mapping[str, str]) -> str:
+    """The run that `log_training` opened; another one where it is gone (a store that was deleted, another server)."""
+    from mlflow.exceptions import MlflowException
+
+    with _client(uri) as client:
+        try:
+            return client.get_run(run_id).info.run_id
+        except MlflowException as error:
+            if error.error_code != "RESOURCE_DOES_NOT_EXIST":
+                raise
+        experiment_id = _experiment_id(client, uri, experiment)
+        same = " and ".join(f"tags.`demobench.{name}` = '{value}'" for name, value in tags.items())
+        found = client.search_runs([experiment_id], same, max_results=1)
+        return found[0].info.run_id if found else _open_run(client, uri, experiment, task, tags)
 
 
 def _child(client: Any, experiment_id: str, parent: str, name: str, seed: int) -> str:

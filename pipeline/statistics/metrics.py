@@ -82,12 +82,6 @@ def _scales(demos: Demonstrations, split: Split, fold: np.ndarray, circular: np.
     return np.stack([scales[number] for number in fold])
 
 
-def per_episode(sums: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Sums over counts, NaN where an episode has no target."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
-
-
 def estimate(values: np.ndarray, counts: np.ndarray, protocol: Protocol) -> float:
     """What a protocol estimates, from episode means `values` [S, E] over `counts` [E] targets; NaN without targets."""
     use = counts > 0
@@ -139,16 +133,16 @@ def span_means(errors: EpisodeErrors, sums: np.ndarray, span: slice) -> tuple[np
     Each horizon that an episode reaches counts once, however many anchors reach it.
     """
     counts = errors.anchors[:, span]
-    means = per_episode(sums[:, :, span], counts[None, :, :, None])
+    means = sums[:, :, span] / np.maximum(counts, 1)[None, :, :, None]
     reached = np.maximum((counts > 0).sum(axis=1), 1)
-    return np.nansum(means, axis=2) / reached[None, :, None], counts.sum(axis=1)
+    return means.sum(axis=2) / reached[None, :, None], counts.sum(axis=1)
 
 
 def _by_horizon(errors: EpisodeErrors, protocol: Protocol) -> dict[str, np.ndarray]:
     """The errors at each horizon [H], averaged over action columns."""
     counts = errors.anchors
-    absolute = per_episode(errors.absolute.mean(axis=3), counts)
-    squared = per_episode(errors.squared.mean(axis=3), counts)
+    absolute = errors.absolute.mean(axis=3) / np.maximum(counts, 1)
+    squared = errors.squared.mean(axis=3) / np.maximum(counts, 1)
     horizons = range(counts.shape[1])
     return {
         "error_by_horizon": np.array([estimate(absolute[:, :, h], counts[:, h], protocol) for h in horizons]),

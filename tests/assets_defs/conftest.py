@@ -53,7 +53,8 @@ class TinyBenchmark:
         self.store.register(target.key, target.experiment.model_dump(mode="json"))
         assets = list(dict.fromkeys(dg.AssetKey(unit.asset.split("/")) for unit in stale))
         with open_instance(self.store.root) as instance:
-            run = run_benchmark(instance, self.defs(**choices), target.key, assets, target.observations)
+            selected = [v.name for v in target.selected]
+            run = run_benchmark(instance, self.defs(**choices), target.key, assets, target.observations, selected)
             assert run.is_success, why_failed(instance, run)
         return [a.to_user_string() for a in assets], run
 
@@ -70,9 +71,9 @@ def tiny_folder(tmp_path_factory) -> Path:
     return write_v3(tmp_path_factory.mktemp("data") / "tiny", tiny_recording(episodes=6, frames=30))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def finished(tiny_folder, tmp_path_factory) -> TinyBenchmark:
-    """The whole graph, run once for a module of tests; they only look."""
+    """The whole graph, run once for all tests; they only look."""
     made = TinyBenchmark(tiny_folder, Store(tmp_path_factory.mktemp("results")).ensure(), TINY)
     made.run()
     return made

@@ -1,6 +1,7 @@
 """Runs started outside the UI: what the instance keeps of them."""
 
 import os
+import signal
 import socket
 
 import dagster as dg
@@ -23,7 +24,7 @@ def test_a_run_can_be_found_and_run_again_by_the_ui(finished):
 def test_an_interrupted_run_ends_as_canceled(finished):
     def stop(event: dg.DagsterEvent) -> None:
         if event.event_type_value == "STEP_START":
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
 
     with open_instance(finished.store.root) as instance:
         with pytest.raises(KeyboardInterrupt):
@@ -37,9 +38,8 @@ def test_runs_whose_process_is_gone_are_closed_and_others_left(finished):
         runs = {}
         for name, pid in (("dead", 2**22 + 1), ("alive", os.getpid())):
             tags = {PID_TAG: str(pid), HOST_TAG: socket.gethostname(), "dagster/partition": "tiny"}
-            runs[name] = instance.create_run_for_job(job_def=job, tags=tags)
-            instance.report_run_starting(runs[name])
+            runs[name] = instance.create_run_for_job(job_def=job, tags=tags, status=dg.DagsterRunStatus.STARTED)
         assert close_dead_runs(instance) == [runs["dead"].run_id]
         assert instance.get_run_by_id(runs["dead"].run_id).status == dg.DagsterRunStatus.FAILURE
-        assert instance.get_run_by_id(runs["alive"].run_id).status == dg.DagsterRunStatus.STARTING
+        assert instance.get_run_by_id(runs["alive"].run_id).status == dg.DagsterRunStatus.STARTED
         instance.report_run_failed(runs["alive"])

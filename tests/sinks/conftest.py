@@ -17,7 +17,7 @@ from pipeline.types import (
     Split,
 )
 
-from .making import make_demos, make_predictions, make_semantics
+from .making import make_demos, make_predictions, make_semantics, make_table
 
 
 @pytest.fixture
@@ -38,6 +38,11 @@ def predictions(demos) -> list[Predictions]:
         make_predictions(demos, [1, 2], "mlp_k04", 4),
         replace(make_predictions(demos, [1, 2], "hold_still", 11, off=20.0), seeds=(0,)),
     ]
+
+
+@pytest.fixture
+def table(demos, semantics) -> dict:
+    return make_table(demos, semantics)
 
 
 @pytest.fixture

@@ -72,3 +72,52 @@ def make_predictions(
         np.zeros(len(anchors), int),
         np.stack([actions, actions + 1]).astype("f4"),
     )
+
+
+def make_row(policy: str, method: str, demos: Demonstrations, *, error: float = 5.0, **more) -> dict:
+    """A row of `run --json`; its numbers are made up."""
+    horizons = list(error + 2.0 * np.arange(more.get("chunk") or 11))
+    names = demos.features[ACTION].names
+    return {
+        "policy": policy, "method": method, "chunk": None, "observations": "state", "seeds": 2, "windows_train": 30,
+        "windows_test": 56, "first_step_mae": error, "first_step_rmse": 1.25 * error, "first_step_l2": 1.4 * error,
+        "at_one_second_mae": None, "at_one_second_rmse": None, "whole_chunk_mae": None, "whole_chunk_rmse": None,
+        "error_by_horizon": horizons, "rmse_by_horizon": horizons,
+        "hold_still_by_horizon": list(20 + 3.0 * np.arange(11)),
+        "error_by_joint": {name: error + i for i, name in enumerate(names)}, "vs_hold_still": 20 / error,
+        "scaled": error / 100, "scaled_by_joint": dict.fromkeys(names, error / 100),
+        "ensembled_first_step_mae": None, "interval": {"first_step_mae": [0.9 * error, 1.1 * error]}, "params": 0,
+        "train_s": 0.0, "latency_ms": 0.12, "verdict": {"vs_hold_still": None, "vs_champion": None}, "rollouts": None,
+    } | more  # fmt: skip
+
+
+def make_table(demos: Demonstrations, semantics: Semantics) -> dict:
+    """One object of `run --json`, with two chunk sizes and hold-still."""
+    action = demos.features[ACTION]
+    rolled = {"n": 50, "success": 0.82, "success_interval": [0.69, 0.91], "score": 0.934}
+    trained = {"params": 275462, "train_s": 12.3}
+    return {
+        "dataset": {
+            "name": demos.name, "revision": demos.revision, "content_hash": demos.content_hash,
+            "episodes": demos.episodes, "frames": demos.frames, "fps": demos.fps, "action_names": list(action.names),
+            "action_units": list(action.units), "action_kinds": list(semantics.kinds),
+            "tracking_lag": list(semantics.tracking_lag),
+        },
+        "protocol": "strict",
+        "budget": {"name": "quick", "steps": 600, "seeds": 2},
+        "split": {"hash": "ab12" * 16, "folds": [{"train": [0], "test": [1, 2]}]},
+        "floor": {
+            "radius": {
+                "probes": 12, "median_neighbours": 5.0, "mean": 6.25, "p90": 11.5, "observations": "state",
+                "radius": 2.0, "scaled": False, "unit": "px",
+            },
+            "estimates": [],
+        },
+        "brackets": [],
+        "policies": [
+            make_row("mlp_k01", "mlp", demos, error=4.5, chunk=1, **trained),
+            make_row("mlp_k04", "mlp", demos, error=5.5, chunk=4, rollouts=rolled, **trained),
+            make_row("hold_still", "hold_still", demos, error=20.0),
+        ],
+        "artifacts": {"report": None, "mcap": "out/held out.mcap", "rerun": "out/held_out.rrd", "mlflow": None},
+    }  # fmt: skip

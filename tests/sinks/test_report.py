@@ -1,0 +1,231 @@
+"""The page: complete, safe whatever a data set is called, and silent on the network."""
+
+import base64
+import hashlib
+import html
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import StoreError
+from pipeline.sinks.figures import benchmark_figures
+from pipeline.sinks.markup import outside_references
+from pipeline.sinks.report import Provenance, render_report, write_report
+from pipeline.types import ACTION
+
+from .making import NASTY, make_demos, make_row, make_semantics, make_table
+
+PROVENANCE = Provenance("demobench run small --protocol strict", 3, "0.1.0 (1a2b3c4)", "2026-11-23", ("dead column",))
+
+
+@pytest.fixture
+def figures(table, demos, semantics, predictions, floor, rollouts):
+    return benchmark_figures(table, demos, semantics, predictions, [floor], [rollouts])
+
+
+def text_of(page: str) -> str:
+    """The words of the body, scripts left out; an observation set comes twice, for wide and for narrow screens."""
+    body = re.sub(r"<(script|style)\b.*?</\1>", " ", page.partition("<body>")[2], flags=re.S)
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", body)).split())
+
+
+def scripts_of(page: str) -> list[tuple[str, str]]:
+    return re.findall(r"<script([^>]*)>(.*?)</script>", page, flags=re.S)
+
+
+def test_the_table_comes_first_and_holds_the_numbers(table, figures):
+    page = text_of(render_report(table, figures, PROVENANCE))
+    assert "mlp_k01 state state 4.50 [4.05, 4.95] 5.62 – – 4.44 0.0450 – – 275,462 12 0.12" in page
+    assert "mlp_k04 state state 5.50 [4.95, 6.05] 6.88 – – 3.64 0.0550 41/50 69–91 % 0.934" in page
+    assert page.index("275,462") < page.index("How fast does the error grow")
+    heads = "First-step MAE px, 95 % interval RMSE px At 1 s MAE, px Whole chunk MAE, px × hold-still ratio Scaled"
+    assert heads in page
+
+
+def test_budget_protocol_seeds_folds_and_hashes_are_said(table, figures):
+    page = text_of(render_report(table, figures, PROVENANCE))
+    assert "protocol strict · budget quick (2 seeds × 600 steps) · 1 fold · 2 episodes held out" in page
+    assert "3 episodes · 90 frames · 10 fps · 2 action columns (position; px) · revision 0123456789ab" in page
+    for said in (table["dataset"]["content_hash"], table["split"]["hash"], PROVENANCE.command, PROVENANCE.version):
+        assert said in page
+    assert "rerun --bind 127.0.0.1 out/held_out.rrd" in page
+    assert "12 probes, median group 5 frames" in page
+    assert "dead column" in page
+
+
+def test_the_answer_is_in_a_sentence(table, figures):
+    page = text_of(render_report(table, figures, PROVENANCE))
+    assert "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]" in page
+    assert "mlp_k04 seeing state succeeds most often: 41 of 50 (69–91 %)." in page
+
+
+def test_what_does_not_apply_is_said_once(demos, semantics, table):
+    for row in table["policies"]:
+        row |= {"rollouts": None, "interval": {"first_step_mae": None}}
+    table["dataset"] |= {"revision": None, "action_units": [None, None]}
+    table["floor"]["radius"] = None
+    page = text_of(
+        render_report(table, benchmark_figures(table, demos, semantics, []), replace(PROVENANCE, warnings=()))
+    )
+    assert "Closed loop: no simulator for this data set." in page
+    assert "No intervals: they need at least five held-out episodes." in page
+    assert "The data set does not state the unit of its actions." in page
+    assert "no revision" in page
+    for absent in ("Success", "warning", "Radius floor", "None", "nan"):
+        assert absent not in page, absent
+
+
+def test_mixed_units_are_warned_of(table, figures):
+    table["dataset"]["action_units"] = ["rad", "m"]
+    assert "Action columns have different units" in text_of(render_report(table, figures, PROVENANCE))
+
+
+def test_the_notebook_protocol_is_explained_as_what_it_is(table, figures):
+    table["protocol"] = "notebook"
+    page = text_of(render_report(table, figures, PROVENANCE))
+    assert "normalisation has seen the held-out episodes" in page
+    assert "Means and deviations come from training episodes only." not in page
+
+
+def test_errors_of_each_action_column_are_there(table, figures):
+    page = text_of(render_report(table, figures, PROVENANCE))
+    assert "First-step MAE of each action column Policy Observations x px y px mlp_k01 state state 4.50 5.50" in page
+
+
+def test_missing_numbers_are_dashes_and_the_page_is_still_json(table, figures):
+    table["policies"][0] |= {"first_step_mae": None, "error_by_horizon": [None], "scaled": None, "latency_ms": None}
+    page = render_report(table, figures, PROVENANCE)
+    assert "mlp_k01 state state – 5.62 – – 4.44 – – – 275,462 12 –" in text_of(page)
+    json.loads(scripts_of(page)[0][1])
+
+
+def hostile_page() -> str:
+    """A page on which every name that a data set chooses is an attack."""
+    demos = make_demos()
+    names = (f"{NASTY}a", '"></style><img src=x onerror="window.pwned=1">')
+    features = {key: replace(f, names=names, units=(NASTY, NASTY)) for key, f in demos.features.items()}
+    demos = replace(demos, name=f"</title>{NASTY}", features=features)
+    semantics = make_semantics(demos)
+    table = make_table(demos, semantics)
+    for row in table["policies"]:
+        row["observations"] = f"set'{NASTY}"
+    table["policies"].append(make_row(f"x]{NASTY}", "act", demos, chunk=2, observations=f"set'{NASTY}"))
+    provenance = Provenance(f"demobench run '{NASTY}'", 3, NASTY, warnings=(f"<b>{NASTY}",))
+    return render_report(table, benchmark_figures(table, demos, semantics, []), provenance)
+
+
+def test_names_from_a_data_set_stay_text():
+    page = hostile_page()
+    assert NASTY not in page
+    assert "<img" not in re.sub(r"<script\b.*?</script>", "", page, flags=re.S)
+    assert NASTY in text_of(page)
+    assert [attributes for attributes, _ in scripts_of(page)] == [' type="application/json" id="charts"', "", ""]
+    assert "</title>" not in page.partition("<title>")[2].partition("</title>")[2]
+    style = page.partition("<style>")[2].partition("</style>")[0]
+    assert "<" not in style
+
+
+def test_only_the_two_scripts_that_the_policy_names_may_run(table, figures):
+    page = render_report(table, figures, PROVENANCE)
+    policy = html.unescape(re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)[1])
+    hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for _, text in scripts_of(page)[1:]]
+    assert re.findall(r"'sha256-([^']*)'", policy) == hashes
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "unsafe-eval" not in policy
+
+
+def test_the_file_asks_for_nothing_and_is_small(tmp_path, table, figures):
+    write_report(tmp_path / "report.html", table, figures, PROVENANCE)
+    assert outside_references(tmp_path / "report.html") == []
+    assert (tmp_path / "report.html").stat().st_size < 3e6
+    assert list(tmp_path.iterdir()) == [tmp_path / "report.html"]
+
+
+def test_a_place_that_cannot_be_written_is_one_clear_message(tmp_path, table):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StoreError, match=r"report\.html cannot be written: .*choose another folder"):
+        write_report(tmp_path / "file" / "report.html", table, [], PROVENANCE)
+
+
+# In a browser ---------------------------------------------------------------------------------------------------------
+
+DRAWN = "document.querySelectorAll('[data-chart] svg').length === document.querySelectorAll('[data-chart]').length"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip("no Chromium on this machine")
+    from playwright.sync_api import sync_playwright
+
+    flags = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--disable-background-networking", "--disable-sync"]
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=program, args=flags)
+        yield opened
+        opened.close()
+
+
+def visit(browser, path: Path, **context):
+    """The page once every chart is drawn, with what it asked for and what it complained about."""
+    page = browser.new_page(**context)
+    asked, said = [], []
+    page.on("request", lambda request: asked.append(request.url))
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.goto(path.as_uri())
+    page.wait_for_function(DRAWN, timeout=60_000)
+    return page, asked, said
+
+
+def test_a_browser_draws_every_chart_and_asks_for_nothing(browser, tmp_path, table, figures):
+    path = tmp_path / "report.html"
+    write_report(path, table, figures, PROVENANCE)
+    page, asked, said = visit(browser, path)
+    assert asked == [path.as_uri()]
+    assert said == []
+    assert page.locator("[data-chart] svg").count() == sum(len(figure.panels) for figure in figures)
+    page.close()
+
+
+def test_hostile_names_do_nothing_in_a_browser(browser, tmp_path):
+    (tmp_path / "page.html").write_text(hostile_page(), encoding="utf-8")
+    page, asked, said = visit(browser, tmp_path / "page.html")
+    assert page.evaluate("window.pwned") is None
+    assert len(asked) == 1
+    assert said == []
+    assert page.locator("img").count() == 0
+    assert page.locator("h1").inner_text() == f"</title>{NASTY}"
+    page.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_charts_follow_the_readers_setting(browser, tmp_path, table, figures, scheme):
+    write_report(tmp_path / "report.html", table, figures, PROVENANCE)
+    page, _, _ = visit(browser, tmp_path / "report.html", color_scheme=scheme)
+    ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    line = page.evaluate("getComputedStyle(document.querySelector('[data-chart] svg path[stroke^=var]')).stroke")
+    assert ground == {"light": "rgb(255, 255, 255)", "dark": "rgb(20, 23, 27)"}[scheme]
+    assert line.startswith("rgb(")
+    assert line != ground
+    page.emulate_media(media="print")
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    page.close()
+
+
+def test_a_phone_scrolls_the_table_and_nothing_else(browser, tmp_path, table, figures):
+    write_report(tmp_path / "report.html", table, figures, PROVENANCE)
+    page, _, _ = visit(browser, tmp_path / "report.html", viewport={"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    assert page.evaluate("Math.max(...[...document.querySelectorAll('.chart svg')].map(s => s.clientWidth))") <= 358
+    page.close()
+
+
+def test_the_units_of_the_data_reach_the_page(tmp_path, demos, semantics, table, predictions):
+    assert demos.features[ACTION].units == ("px", "px")
+    page = render_report(table, benchmark_figures(table, demos, semantics, predictions), PROVENANCE)
+    assert "mean error (px)" in page

@@ -1,0 +1,202 @@
+"""Recordings are read back by Rerun's own reader and checked by its own command line."""
+
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from pipeline.errors import StoreError
+from pipeline.sinks import to_rerun
+from pipeline.sinks.to_rerun import episodes_in, has_paths, view, write_rerun
+from pipeline.types import ACTION, STATE
+
+from .making import NASTY, make_demos, make_predictions, make_semantics
+
+
+def read(path: Path) -> dict[str, list]:
+    """Entity → its chunks."""
+    found: dict[str, list] = {}
+    for chunk in RrdReader(path).stream():
+        found.setdefault(chunk.entity_path, []).append(chunk)
+    return found
+
+
+def column(chunks: list, ending: str) -> list:
+    """All values of the one column whose name ends so, over chunks in order of time."""
+    tables = [chunk.to_record_batch() for chunk in chunks]
+    tables = [t for t in tables if any(name.endswith(ending) for name in t.schema.names)]
+    tables.sort(key=lambda t: t["frame"][0].as_py() if "frame" in t.schema.names else -1)
+    return [value for t in tables for name in t.schema.names if name.endswith(ending) for value in t[name].to_pylist()]
+
+
+@pytest.fixture
+def recording(tmp_path, demos, semantics, predictions) -> Path:
+    path = tmp_path / "held_out.rrd"
+    write_rerun(path, demos, semantics, predictions, [1, 2], name="small")
+    return path
+
+
+def test_rerun_itself_finds_no_fault(recording):
+    checked = subprocess.run(
+        [sys.executable, "-m", "rerun_cli", "rrd", "verify", str(recording)], capture_output=True, text=True
+    )
+    assert checked.returncode == 0, checked.stderr
+    assert "verified without error" in checked.stdout + checked.stderr
+
+
+def test_joints_hold_state_recorded_action_and_every_policy(recording, demos, predictions):
+    frames = demos.episode(1)
+    values = np.array(column(read(recording)["/episode_008/joints/x"], "Scalars:scalars"))
+    np.testing.assert_allclose(values[:, 0], demos.columns[STATE][frames, 0])
+    np.testing.assert_allclose(values[:, 1], demos.columns[ACTION][frames, 0])
+    for place, one in enumerate(predictions):
+        assert np.isnan(values[:2, 2 + place]).all()  # no history yet, so not asked
+        np.testing.assert_allclose(values[2:, 2 + place], one.actions[0, one.in_frames(frames), 0, 0])
+
+
+def test_names_and_colours_are_static(recording):
+    chunks = [chunk for chunk in read(recording)["/episode_008/joints/x"] if chunk.is_static]
+    assert column(chunks, "SeriesLines:names") == [["state", "recorded action", "mlp_k01", "mlp_k04", "hold_still"]]
+    assert len(set(column(chunks, "SeriesLines:colors")[0])) == 5
+
+
+def test_time_lines_are_seconds_from_the_start_of_each_episode(recording, demos):
+    for episode in (1, 2):
+        chunks = read(recording)[f"/episode_{demos.episode_ids[episode]:03d}/error"]
+        seconds = [t.total_seconds() for t in column(chunks, "time")]
+        np.testing.assert_allclose(seconds, demos.timestamps[demos.episode(episode)], atol=1e-6)
+        assert column(chunks, "frame") == list(range(len(seconds)))
+
+
+def test_the_error_is_the_mean_over_columns_of_the_first_action(recording):
+    values = np.array(column(read(recording)["/episode_008/error"], "Scalars:scalars"))
+    np.testing.assert_allclose(values[2:], np.tile([5.0, 5.0, 20.0], (len(values) - 2, 1)), atol=1e-3)
+
+
+def test_errors_of_angles_go_the_short_way_round(tmp_path):
+    demos = make_demos(columns=1, lengths=(6,))
+    actions = np.full((6, 1), 3.1, np.float32)
+    demos = replace(demos, columns={STATE: actions, ACTION: actions})
+    semantics = replace(make_semantics(demos), circular={ACTION: (True,), STATE: (True,)})
+    write_rerun(tmp_path / "a.rrd", demos, semantics, [make_predictions(demos, [0], off=0.1)], [0], name="a")
+    wrapped = replace(make_predictions(demos, [0]), actions=np.full((2, 4, 1, 1), -3.1, np.float32))
+    write_rerun(tmp_path / "b.rrd", demos, semantics, [wrapped], [0], name="b")
+    values = np.array(column(read(tmp_path / "b.rrd")["/episode_007/error"], "Scalars:scalars"))
+    np.testing.assert_allclose(values[2:], 2 * np.pi - 6.2, atol=1e-5)
+
+
+def test_positions_in_a_plane_have_paths_with_the_chunk_predicted_now(recording, demos, predictions):
+    frames = demos.episode(1)
+    entities = read(recording)
+    strips = column(entities["/episode_008/path/mlp_k04/state"], "LineStrips2D:strips")
+    one = predictions[1]
+    first = one.in_frames(frames)[0]
+    expected = [demos.columns[STATE][one.anchors[first]], *one.actions[0, first]]
+    np.testing.assert_allclose(strips[0][0], expected)
+    assert len(strips) == len(one.in_frames(frames))
+    assert len(column(entities["/episode_008/path/recorded"], "LineStrips2D:strips")[0][0]) == 24
+
+
+def test_joints_that_are_no_plane_have_no_paths(tmp_path):
+    demos = make_demos(columns=3)
+    semantics = make_semantics(demos, "velocity")
+    assert not has_paths(demos, semantics)
+    write_rerun(tmp_path / "a.rrd", demos, semantics, [make_predictions(demos, [0])], [0], name="a")
+    entities = read(tmp_path / "a.rrd")
+    assert not [entity for entity in entities if "/path" in entity]
+    static = [chunk for chunk in entities["/episode_007/joints/x"] if chunk.is_static]
+    assert column(static, "SeriesLines:names") == [["recorded action", "mlp_k04"]]
+
+
+def test_it_opens_with_its_own_layout_and_says_what_it_is(recording, demos):
+    reader = RrdReader(recording)
+    assert len(reader.blueprints()) == 1
+    assert [entry.application_id for entry in reader.recordings()] == ["demobench"]
+    said = [
+        str(chunk.to_record_batch().to_pydict())
+        for entity, chunks in read(recording).items()
+        for chunk in chunks
+        if "propert" in entity
+    ]
+    assert any(demos.content_hash in text for text in said)
+
+
+def test_policies_asked_about_some_episodes_only(tmp_path, demos, semantics):
+    write_rerun(tmp_path / "a.rrd", demos, semantics, [make_predictions(demos, [2])], [0, 2], name="a")
+    values = np.array(column(read(tmp_path / "a.rrd")["/episode_007/joints/x"], "Scalars:scalars"))
+    assert np.isnan(values[:, 2]).all()
+    assert "/episode_007/path/mlp_k04/state" not in read(tmp_path / "a.rrd")
+    assert episodes_in(tmp_path / "a.rrd") == {7, 9}
+
+
+def test_no_predictions_at_all(tmp_path, demos, semantics):
+    write_rerun(tmp_path / "a.rrd", demos, semantics, [], [0], name="a")
+    assert "/episode_007/error" not in read(tmp_path / "a.rrd")
+    assert episodes_in(tmp_path / "a.rrd") == {7}
+
+
+def test_two_observation_sets_are_told_apart(tmp_path, demos, semantics):
+    predictions = [make_predictions(demos, [0], observations=name) for name in ("position", "pose")]
+    write_rerun(tmp_path / "a.rrd", demos, semantics, predictions, [0], name="a")
+    static = [chunk for chunk in read(tmp_path / "a.rrd")["/episode_007/error"] if chunk.is_static]
+    assert column(static, "SeriesLines:names") == [["mlp_k04 (position)", "mlp_k04 (pose)"]]
+    assert len(set(column(static, "SeriesLines:colors")[0])) == 2
+
+
+def test_any_name_of_a_column_becomes_one_entity(tmp_path, demos, semantics):
+    names = ("left/arm joint.pos", NASTY)
+    demos = replace(demos, features={key: replace(f, names=names) for key, f in demos.features.items()})
+    write_rerun(tmp_path / "a.rrd", demos, semantics, [], [0], name=NASTY)
+    assert len([entity for entity in read(tmp_path / "a.rrd") if entity.startswith("/episode_007/joints/")]) == 2
+    same = replace(demos, features={key: replace(f, names=("m", "m")) for key, f in demos.features.items()})
+    write_rerun(tmp_path / "b.rrd", same, semantics, [], [0], name="b")
+    assert {"/episode_007/joints/m_0", "/episode_007/joints/m_1"} <= set(read(tmp_path / "b.rrd"))
+
+
+def test_ten_episodes_and_eight_policies_are_quick_and_small(tmp_path):
+    demos = make_demos(columns=6, lengths=(300,) * 10, fps=30.0)
+    predictions = [make_predictions(demos, list(range(10)), f"mlp_k{k:02d}", k) for k in (1, 2, 4, 8, 16, 20, 24, 32)]
+    started = time.perf_counter()
+    write_rerun(tmp_path / "a.rrd", demos, make_semantics(demos), predictions, list(range(10)), name="a")
+    assert time.perf_counter() - started < 10
+    assert (tmp_path / "a.rrd").stat().st_size < 20e6
+
+
+def test_a_failure_leaves_the_earlier_recording(recording, demos, semantics, predictions):
+    before = recording.read_bytes()
+    with pytest.raises(IndexError):
+        write_rerun(recording, demos, semantics, predictions, [1, 99], name="small")
+    assert recording.read_bytes() == before
+    assert list(recording.parent.iterdir()) == [recording]
+
+
+def test_a_folder_that_cannot_be_written_is_one_clear_message(tmp_path, demos, semantics):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StoreError, match=r"a\.rrd cannot be written: .*choose another folder"):
+        write_rerun(tmp_path / "file" / "a.rrd", demos, semantics, [], [0], name="a")
+
+
+def test_the_viewer_listens_on_this_machine_only(recording, monkeypatch):
+    started = []
+
+    class Viewer:
+        def __init__(self, command):
+            started.append(command)
+
+        def wait(self):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(to_rerun.subprocess, "Popen", Viewer)
+    view(recording)
+    assert started[0][started[0].index("--bind") + 1] == "127.0.0.1"
+    assert started[0][-1] == str(recording)
+
+
+def test_viewing_what_is_not_there_says_what_to_do(tmp_path):
+    with pytest.raises(StoreError, match=r"no recording at .*none\.rrd.*demobench run"):
+        view(tmp_path / "none.rrd")
