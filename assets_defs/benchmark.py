@@ -48,7 +48,9 @@ def _benchmark_table(deps: Sequence[dg.AssetKey], floor: dg.AssetsDefinition) ->
             "table": table(header, made.summary["rows"]),
             "protocol": bench.experiment.protocol,
             "budget": bench.experiment.budget_words,
-            **{f"first_step_mae_{row[0]}_{row[1]}": float(row[2]) for row in made.summary["rows"] if row[2] is not None},
+            **{
+                f"first_step_mae_{row[0]}_{row[1]}": float(row[2]) for row in made.summary["rows"] if row[2] is not None
+            },
         }
         return result(bench, TABLE, {"": made}, metadata, ["baselines_present", "same_data"])
 
@@ -162,11 +164,17 @@ def _write_report(bench: Bench, draft) -> Outcome:
 
     plan = bench.plan
     built = json.loads((plan.folder(Unit("benchmark_table")) / "table.json").read_text())
+    built["artifacts"] |= {"mcap": "../mcap_log/held_out.mcap", "rerun": "../rerun_recording/held_out.rrd"}
     predictions = [load_predictions(plan.folder(u)) for u in plan.fresh_policy_units("predictions")]
     floors = load_floors(plan.folder(Unit("multimodality_floor")) / "floors.json")
     rolled = [u for u in plan.fresh_policy_units("rollouts") if bench.summary(u)["rollouts"]]
     figures = benchmark_figures(
-        built, bench.demonstrations, bench.semantics, predictions, floors, [load_rollouts(plan.folder(u)) for u in rolled]
+        built,
+        bench.demonstrations,
+        bench.semantics,
+        predictions,
+        floors,
+        [load_rollouts(plan.folder(u)) for u in rolled],
     )
     provenance = Provenance(
         command=bench.experiment.command,

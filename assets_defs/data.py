@@ -23,7 +23,9 @@ def key(name: str) -> dg.AssetKey:
     kinds={"lerobot", "parquet"},
     code_version=code_version("demonstrations"),
     check_specs=[
-        check_spec(key("demonstrations"), "stored_as_read", "What lies in the store has the content hash of what was read."),
+        check_spec(
+            key("demonstrations"), "stored_as_read", "What lies in the store has the content hash of what was read."
+        ),
         check_spec(key("demonstrations"), "counts", "Every episode has frames, and they add up to the whole."),
     ],
 )
@@ -76,7 +78,9 @@ def demonstrations(
         "revision": facts["revision"],
         "actions": table(
             ["action", "unit", "kind", "tracking lag"],
-            zip(facts["action_names"], facts["action_units"], facts["action_kinds"], facts["tracking_lag"], strict=True),
+            zip(
+                facts["action_names"], facts["action_units"], facts["action_kinds"], facts["tracking_lag"], strict=True
+            ),
         ),
         "trajectories": picture(bench.plan.folder(unit) / "trajectories.png"),
         "warnings": dg.MetadataValue.md("\n".join(f"- {w}" for w in facts["warnings"])) if facts["warnings"] else None,
@@ -149,7 +153,10 @@ def episode_split(
             {"hash": made.hash, "sizes": sizes},
             {
                 "no_leakage": (shared == 0, f"{shared} episodes on both sides"),
-                "held_out": (all(min(s) > 0 for s in sizes), f"{len(sizes)} fold(s), {min(s[1] for s in sizes)} held out"),
+                "held_out": (
+                    all(min(s) > 0 for s in sizes),
+                    f"{len(sizes)} fold(s), {min(s[1] for s in sizes)} held out",
+                ),
             },
         )
 

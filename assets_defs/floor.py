@@ -44,7 +44,12 @@ def multimodality_floor(
         sound = all(f.refused or (f.mean == f.mean and f.mean >= 0) for f in floors)
         return Outcome(
             {"rows": [[None if v != v else v for v in row] for row in rows]},
-            {"answered_or_refused": (sound, "; ".join(f"{f.observations}: {f.refused or f'{f.mean:.4g}'}" for f in floors))},
+            {
+                "answered_or_refused": (
+                    sound,
+                    "; ".join(f"{f.observations}: {f.refused or f'{f.mean:.4g}'}" for f in floors),
+                )
+            },
         )
 
     unit = Unit("multimodality_floor")

@@ -90,7 +90,8 @@ def run_benchmark(
 ) -> dg.DagsterRun:
     """Run the selected assets of one partition in this process; returns the finished run.
 
-    `observations` and `policies` are what was asked for, where that is not everything. `on_event` sees every Dagster event as it happens. Ctrl-C ends the run as CANCELED and is raised again.
+    `observations` and `policies` are what was asked for, where that is not everything. `on_event` sees every Dagster event
+    as it happens. Ctrl-C ends the run as CANCELED and is raised again.
     """
     instance.add_dynamic_partitions(str(PARTITIONS.name), [partition])
     selection = set(assets)
@@ -138,6 +139,6 @@ def _is_interrupt(event: dg.DagsterEvent) -> bool:
 
 def _job_origin() -> RemoteJobOrigin:
     """Where the UI finds this job: the same module and location name as in workspace.yaml."""
-    target = LoadableTargetOrigin(executable_path=sys.executable, module_name=MODULE, working_directory=os.getcwd())
+    target = LoadableTargetOrigin(executable_path=sys.executable, module_name=MODULE, working_directory=str(Path.cwd()))
     location = ManagedGrpcPythonEnvCodeLocationOrigin(target, LOCATION)
     return RemoteJobOrigin(RemoteRepositoryOrigin(location, "__repository__"), BENCHMARK)

@@ -39,6 +39,10 @@ def _task(bench: Bench, variant: Variant, unit: Unit):
     )  # fmt: skip
 
 
+def _everyone(bench: Bench) -> list[str]:
+    return [v.name for v in bench.plan.variants]
+
+
 def _tracking(bench: Bench) -> str:
     from pipeline.sinks.to_mlflow import tracking_uri
 
@@ -76,10 +80,10 @@ def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
         made = {}
         for unit in bench.plan.selected_units(variant, "trained_policy"):
             made[unit.entry] = bench.make(unit, lambda draft, unit=unit: _train(bench, variant, unit, draft))
-        rows = [(entry, m.summary["parameters"], m.summary["train_s"], m.summary["last_loss"]) for entry, m in made.items()]
-        links = {
-            f"mlflow_{entry}": dg.MetadataValue.text(m.summary["mlflow_run_id"]) for entry, m in made.items()
-        }
+        rows = [
+            (entry, m.summary["parameters"], m.summary["train_s"], m.summary["last_loss"]) for entry, m in made.items()
+        ]
+        links = {f"mlflow_{entry}": dg.MetadataValue.text(m.summary["mlflow_run_id"]) for entry, m in made.items()}
         plots = {
             f"losses_{unit.entry}": picture(bench.plan.folder(unit) / "losses.png")
             for unit in bench.plan.selected_units(variant, "trained_policy")
@@ -101,10 +105,12 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
     task = _task(bench, variant, unit)
     unfinished = bench.store.dataset(bench.plan.key) / ".unfinished" / bench.plan.fingerprint(unit)
     name = f"{variant.name} {unit.entry}"
-    folds = train_folds(task, draft, unfinished, lambda done, total, loss: bench.progress(name, done, total, f"loss {loss:.4g}"))
+    folds = train_folds(
+        task, draft, unfinished, lambda done, total, loss: bench.progress(name, done, total, f"loss {loss:.4g}")
+    )
     last = float(np.mean([t.losses[:, -1].mean() for t in folds])) if variant.is_trained else None
     if variant.is_trained:
-        picture_losses(folds[0], variant.name, draft / "losses.png")
+        picture_losses(folds[0], variant.name, _everyone(bench), draft / "losses.png")
     run_id = to_mlflow.log_training(
         _tracking(bench),
         experiment=bench.plan.key,
@@ -121,7 +127,12 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
             "last_loss": last,
             "mlflow_run_id": run_id,
         },
-        {"finite_losses": (last is None or bool(np.isfinite(last)), "nothing trained" if last is None else f"{last:.4g}")},
+        {
+            "finite_losses": (
+                last is None or bool(np.isfinite(last)),
+                "nothing trained" if last is None else f"{last:.4g}",
+            )
+        },
     )
 
 
@@ -149,7 +160,12 @@ def _predictions(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDef
         for unit in bench.plan.selected_units(variant, "predictions"):
             made[unit.entry] = bench.make(unit, lambda draft, unit=unit: _predict(bench, variant, unit, draft))
         rows = [
-            (entry, m.summary["metrics"]["first_step_mae"], m.summary["metrics"]["vs_hold_still"], m.summary["latency_ms"])
+            (
+                entry,
+                m.summary["metrics"]["first_step_mae"],
+                m.summary["metrics"]["vs_hold_still"],
+                m.summary["latency_ms"],
+            )
             for entry, m in made.items()
         ]
         plots = {
@@ -181,7 +197,7 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
     score = score_task(task, predicted)
     save_predictions(predicted, draft)
     save_errors(score.errors, draft / "errors.safetensors")
-    picture_horizons(score.metrics, variant.name, task.demos, draft / "error_by_horizon.png")
+    picture_horizons(score.metrics, variant.name, _everyone(bench), task.demos, draft / "error_by_horizon.png")
     to_mlflow.log_scores(
         _tracking(bench),
         _mlflow_run(bench, task, trained_unit),

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import dagster as dg
+from pydantic import Field
 
 from assets_defs.plan import CODE_VERSIONS, Plan, Unit
 from pipeline.config import Config, hash_of
@@ -30,8 +31,8 @@ class Budget(dg.ConfigurableResource):
 
     seeds: int | None = None
     steps: int | None = None
-    observations: list[str] = []
-    policies: list[str] = []
+    observations: list[str] = Field(default_factory=list)
+    policies: list[str] = Field(default_factory=list)
 
     def asks_for(self, variant: Variant) -> bool:
         """Whether the launch named this policy, or named none and it need not be named."""
@@ -184,7 +185,6 @@ class Bench:
             self.store.write_made(draft, made)
         self.plan.forget()
         return made
-
 
 
 def result(

@@ -27,11 +27,13 @@ record_app = typer.Typer(help="Record demonstrations in simulation, by scripted 
 app.add_typer(record_app, name="record")
 
 ConfigOption = Annotated[
-    Path | None, typer.Option("--config", help="Configuration; else DEMOBENCH_CONFIG, else ./demobench.toml, else built-in.")
+    Path | None,
+    typer.Option("--config", help="Configuration; else DEMOBENCH_CONFIG, else ./demobench.toml, else built-in."),
 ]
 StoreOption = Annotated[str | None, typer.Option("--store", help="The folder for results; else the configuration's.")]
 JsonOption = Annotated[
-    str | None, typer.Option("--json", metavar="FILE|-", help="Write the numbers as JSON to a file, or to standard output.")
+    str | None,
+    typer.Option("--json", metavar="FILE|-", help="Write the numbers as JSON to a file, or to standard output."),
 ]
 
 
@@ -53,14 +55,20 @@ def run(
     datasets: Annotated[
         list[str] | None, typer.Argument(metavar="[DATASET …]", help="Names from the file, folders, or hub:owner/name.")
     ] = None,
-    policies: Annotated[str | None, typer.Option(help="Only these (baselines are always there): mlp,hold_still")] = None,
+    policies: Annotated[
+        str | None, typer.Option(help="Only these (baselines are always there): mlp,hold_still")
+    ] = None,
     chunks: Annotated[str | None, typer.Option(help="Only these chunk sizes: 1,16")] = None,
     observations: Annotated[str | None, typer.Option(help="Only these observation sets: position,pose")] = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Training seeds.")] = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Training steps.")] = None,
-    budget: Annotated[BudgetName | None, typer.Option(help="quick (600 steps), standard (3,000) or thorough (20,000).")] = None,
+    budget: Annotated[
+        BudgetName | None, typer.Option(help="quick (600 steps), standard (3,000) or thorough (20,000).")
+    ] = None,
     folds: Annotated[int | None, typer.Option(min=1, help="Folds of the split by episode.")] = None,
-    protocol: Annotated[Protocol | None, typer.Option(help="strict, or notebook to reproduce published numbers.")] = None,
+    protocol: Annotated[
+        Protocol | None, typer.Option(help="strict, or notebook to reproduce published numbers.")
+    ] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="auto, cpu or cuda.")] = None,
     config: ConfigOption = None,
     store: StoreOption = None,
@@ -106,7 +114,9 @@ def floor(
     commands.measure_floor(dataset, radius, probes, min_neighbours, observations, config, json_to)
 
 
-@app.command(epilog="Examples:\n\n    demobench view pusht_sim 12\n\n    demobench view pusht_sim 12 --save episode.rrd")
+@app.command(
+    epilog="Examples:\n\n    demobench view pusht_sim 12\n\n    demobench view pusht_sim 12 --save episode.rrd"
+)
 def view(
     dataset: Annotated[str, typer.Argument(help="A data set that was benchmarked.")],
     episode: Annotated[int, typer.Argument(help="The episode's recorded number.")],

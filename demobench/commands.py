@@ -290,7 +290,9 @@ def view_episode(
     names = {u.asset.split("/")[0] for u in units}
     for name in wanted:
         if name not in names:
-            raise ConfigError(f"No up-to-date predictions of a policy '{name}' for '{target.key}'. {did_you_mean(name, names)}")
+            raise ConfigError(
+                f"No up-to-date predictions of a policy '{name}' for '{target.key}'. {did_you_mean(name, names)}"
+            )
     predictions = [load_predictions(plan.folder(u)) for u in units if not wanted or u.asset.split("/")[0] in wanted]
     frames = demos.episode(int(position[0]))
     if not any(len(p.in_frames(frames)) for p in predictions):

@@ -57,7 +57,9 @@ class RunProgress:
         )  # fmt: skip
 
     def __enter__(self) -> "RunProgress":
-        self.say(f"[bold]{self._target.key}[/]: {len(self._assets)} assets to make, {self._target.experiment.budget_words}")
+        self.say(
+            f"[bold]{self._target.key}[/]: {len(self._assets)} assets to make, {self._target.experiment.budget_words}"
+        )
         self._bars.start()
         self._whole = self._bars.add_task(self._target.key, total=len(self._assets), note="")
         self._current = self._bars.add_task("starting", total=None, note="", visible=self._live)

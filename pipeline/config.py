@@ -91,8 +91,7 @@ class ScheduleConfig(Settings):
 
 
 BASELINES = {
-    name: PolicyConfig(method=name)
-    for name in ("hold_still", "mean_action", "constant_velocity", "nearest_neighbour")
+    name: PolicyConfig(method=name) for name in ("hold_still", "mean_action", "constant_velocity", "nearest_neighbour")
 }
 """Always in a benchmark; a file need not name them."""
 
@@ -151,7 +150,9 @@ def load_config(path: Path | None) -> Config:
     try:
         raw = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ConfigError(f"No configuration file at {path}. Leave --config out to use the built-in defaults.") from None
+        raise ConfigError(
+            f"No configuration file at {path}. Leave --config out to use the built-in defaults."
+        ) from None
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{path} cannot be read as TOML: {error}.") from None
     return parse_config(raw, str(path))

@@ -220,7 +220,7 @@ def resolve_target(
         experiment=changed,
         selected=tuple(selected),
         observations=choices.observations,
-        file_has_it=set(v.name for v in changed.variants) <= set(v.name for v in base.variants),
+        file_has_it={v.name for v in changed.variants} <= {v.name for v in base.variants},
     )
 
 

@@ -54,14 +54,19 @@ def inside(folder: Path, relative: str) -> Path:
     path = folder / relative
     pure = Path(relative)
     outside = pure.is_absolute() or ".." in pure.parts or "\0" in relative
-    if not outside:
-        outside = not path.resolve().is_relative_to(_home(folder))
-    if outside:
+    if outside or not _resolves_into(path, _home(folder)):
         raise DatasetError(
             f"{folder}: '{relative}' leads out of the data set's folder, so it is not read. "
             "Put the files inside the folder (links that leave it do not count) and correct meta/info.json."
         )
     return path
+
+
+def _resolves_into(path: Path, home: Path) -> bool:
+    try:
+        return path.resolve().is_relative_to(home)
+    except (OSError, RuntimeError):  # links that go round in a circle
+        return False
 
 
 def _home(folder: Path) -> Path:
@@ -78,7 +83,7 @@ def read_json(folder: Path, relative: str) -> Any:
     text = _read_text(folder, relative)
     try:
         return json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise DatasetError(
             f"{folder / relative} is not JSON ({error}). The file is damaged: copy the data set again."
         ) from None
@@ -92,7 +97,7 @@ def read_json_lines(folder: Path, relative: str) -> list[dict[str, Any]]:
             continue
         try:
             row = json.loads(line)
-        except (json.JSONDecodeError, RecursionError):
+        except (ValueError, RecursionError):
             row = None
         if not isinstance(row, dict):
             raise DatasetError(

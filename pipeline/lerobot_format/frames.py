@@ -4,6 +4,7 @@ What belongs here: types, shapes and missing values of columns. What does not: w
 meta/ lists (read.py).
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -42,6 +43,16 @@ class Frames:
     warnings: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class _Survey:
+    """What the footers say: frames of each file, columns of every file, values of the largest row group, notes."""
+
+    rows: list[int]
+    shared: set[str]
+    largest_group: int
+    notes: list[str]
+
+
 _INDEX = {"episode_index": np.int64, "frame_index": np.int64, "task_index": np.int64, "timestamp": np.float64}
 
 
@@ -51,70 +62,82 @@ def read_frames(layout: Layout) -> Frames:
     Raises:
         DatasetError: a file is missing or damaged, a column is missing, has another shape, or does not fit into memory.
     """
-    counts, shared, warnings = _survey(layout)
-    total = sum(counts)
-    features = {key: feature for key, feature in layout.features.items() if key in shared}
-    _check_memory(layout, total, features)
+    survey = _survey(layout)
+    total = sum(survey.rows)
+    features = {key: feature for key, feature in layout.features.items() if key in survey.shared}
+    _check_memory(layout, total, features, survey.largest_group)
     columns = {key: np.empty((total, len(feature.names)), np.float32) for key, feature in features.items()}
-    index = {key: np.empty(total, dtype) for key, dtype in _INDEX.items() if key in shared}
+    index = {key: np.empty((total, 1), dtype) for key, dtype in _INDEX.items() if key in survey.shared}
     row, large = 0, set()
     for file in layout.files:
         for group in _row_groups(layout, file, [*columns, *index]):
             rows = slice(row, row + group.num_rows)
-            for key, target in columns.items():
+            for key, target in (columns | index).items():
                 values = _numbers(layout, file, group, key, target.shape[1])
-                if values.dtype.kind in "iu" and values.size and np.abs(values).max() > EXACT_INTEGERS:
+                if key in columns and _is_rounded_by_float32(values):
                     large.add(key)
-                with np.errstate(over="ignore"):
+                with np.errstate(over="ignore", invalid="ignore"):  # what comes out is checked for being finite
                     target[rows] = values
-            for key, target in index.items():
-                target[rows] = _numbers(layout, file, group, key, 1)[:, 0]
             row = rows.stop
-    warnings += [
+    index = {key: values[:, 0] for key, values in index.items()}
+    rounded = [
         f"Feature '{key}' holds whole numbers too large for float32; they were rounded." for key in sorted(large)
     ]
     return Frames(
         columns=columns,
-        file_of=np.repeat(np.arange(len(counts)), counts),
+        file_of=np.repeat(np.arange(len(survey.rows)), survey.rows),
         episode_id=index.get("episode_index"),
         frame_index=index.get("frame_index"),
         task_index=index.get("task_index"),
         timestamps=index.get("timestamp"),
-        warnings=tuple(warnings),
+        warnings=(*survey.notes, *rounded),
     )
 
 
-def _survey(layout: Layout) -> tuple[list[int], set[str], list[str]]:
-    """From the footers alone: frames of each file, columns that every file has, notes on those that some lack."""
-    counts: list[int] = []
-    everywhere: set[str] | None = None
+def _is_rounded_by_float32(values: np.ndarray) -> bool:
+    return values.dtype.kind in "iu" and values.size > 0 and bool(np.abs(values).max() > EXACT_INTEGERS)
+
+
+def _survey(layout: Layout) -> _Survey:
+    """Look at every footer."""
+    expected: Counter[str] = Counter()
+    for entry in layout.episodes:
+        expected[entry.file] += entry.length
+    rows: list[int] = []
+    shared: set[str] | None = None
     somewhere: set[str] = set()
+    largest = 0
     for file in layout.files:
         with open_parquet(layout.folder, file) as parquet:
-            names = set(parquet.schema_arrow.names)
-            _check_size(layout, file, parquet)
-            counts.append(parquet.metadata.num_rows)
-        for key in (ACTION, STATE):
-            if key not in names:
-                raise DatasetError(
-                    f"{layout.folder / file} has no column '{key}', which meta/info.json declares. "
-                    f"It has: {', '.join(sorted(names))}. Record the column, or correct meta/info.json."
-                )
-        everywhere = names if everywhere is None else everywhere & names
-        somewhere |= names
-    shared = everywhere or set()
+            names = parquet.schema_arrow.names
+            _check_columns(layout, file, names)
+            _check_rows(layout, file, parquet.metadata.num_rows, expected[file])
+            rows.append(parquet.metadata.num_rows)
+            largest = max(largest, _values_of_largest_group(parquet, {*layout.features, *_INDEX}))
+        shared = set(names) if shared is None else shared & set(names)
+        somewhere |= set(names)
     notes = []
     for key in (*layout.features, *_INDEX):
-        if key not in shared:
+        if key not in (shared or ()):
             where = "only in some data files" if key in somewhere else "in no data file"
             notes.append(f"Column '{key}' is {where}; it was {'derived' if key in _INDEX else 'left out'}.")
-    return counts, shared, notes
+    return _Survey(rows, shared or set(), largest, notes)
 
 
-def _check_size(layout: Layout, file: str, parquet: "pq.ParquetFile") -> None:
-    """A footer may claim any number of rows; no honest file holds more than the episodes in it."""
-    expected = sum(entry.length for entry in layout.episodes if entry.file == file)
-    rows = parquet.metadata.num_rows
+def _check_columns(layout: Layout, file: str, names: list[str]) -> None:
+    for key in (ACTION, STATE):
+        if key not in names:
+            raise DatasetError(
+                f"{layout.folder / file} has no column '{key}', which meta/info.json declares. "
+                f"It has: {', '.join(sorted(names))}. Record the column, or correct meta/info.json."
+            )
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise DatasetError(f"{layout.folder / file} has the column '{twice}' twice. Remove one of the two.")
+
+
+def _check_rows(layout: Layout, file: str, rows: int, expected: int) -> None:
+    """A footer may claim any number of rows; no honest file holds other than the episodes in it."""
     if rows != expected:
         raise DatasetError(
             f"{layout.folder / file} has {rows:,} frames; the episodes that meta/ lists in it have {expected:,}. "
@@ -122,10 +145,26 @@ def _check_size(layout: Layout, file: str, parquet: "pq.ParquetFile") -> None:
         )
 
 
-def _check_memory(layout: Layout, total: int, features: dict[str, Feature]) -> None:
+def _values_of_largest_group(parquet: "pq.ParquetFile", wanted: set[str]) -> int:
+    """Single values that reading the wanted columns of one row group takes into memory."""
+    metadata, largest = parquet.metadata, 0
+    for number in range(metadata.num_row_groups):
+        group = metadata.row_group(number)
+        columns = [group.column(position) for position in range(group.num_columns)]
+        chosen = [column for column in columns if any(_is_part(column.path_in_schema, key) for key in wanted)]
+        largest = max(largest, sum(column.num_values for column in chosen))
+    return largest
+
+
+def _is_part(path: str, key: str) -> bool:
+    """Whether a leaf such as `action.list.element` belongs to the column `action`."""
+    return path == key or path.startswith(f"{key}.")
+
+
+def _check_memory(layout: Layout, total: int, features: dict[str, Feature], largest_group: int) -> None:
     import psutil
 
-    needed = total * (4 * sum(len(feature.names) for feature in features.values()) + 40)
+    needed = total * (4 * sum(len(feature.names) for feature in features.values()) + 40) + 8 * largest_group
     free = psutil.virtual_memory().available
     if needed > 0.8 * free:
         raise DatasetError(

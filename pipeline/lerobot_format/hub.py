@@ -25,6 +25,7 @@ TIMEOUT_S = 15.0
 
 _REPOSITORY = re.compile(r"[A-Za-z0-9_][\w.-]{0,95}/[A-Za-z0-9_][\w.-]{0,95}", re.ASCII)
 _REVISION = re.compile(r"[\w][\w./+-]{0,199}", re.ASCII)
+_ADDRESS = re.compile(r"https?://([^/@\s]*@)?[\w.-]+(:\d{1,5})?(/\S*)?", re.ASCII)
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
@@ -228,14 +229,16 @@ def _failures_of(repository: str, revision: str | None) -> Iterator[None]:
 
 def _endpoint() -> str:
     """The Hub's address, read when it is needed."""
-    return (os.environ.get("HF_ENDPOINT") or "https://huggingface.co").rstrip("/")
+    address = (os.environ.get("HF_ENDPOINT") or "https://huggingface.co").rstrip("/")
+    if not _ADDRESS.fullmatch(address):
+        raise HubError("HF_ENDPOINT is not the address of a Hub. Unset it, or write it as https://host.")
+    return address
 
 
 def _host() -> str:
     """The address as it may be shown: without a user's name or password."""
     parts = urlsplit(_endpoint())
-    port = f":{parts.port}" if parts.port else ""
-    return f"{parts.scheme}://{parts.hostname}{port}"
+    return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}"
 
 
 def _cache_folder() -> Path:

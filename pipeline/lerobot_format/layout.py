@@ -44,7 +44,6 @@ class Layout:
     """Everything meta/ says, checked in itself. `episodes` in the order of their ids; `tasks` task_index → words."""
 
     folder: Path
-    version: str
     fps: float
     robot_type: str | None
     features: Mapping[str, Feature]
@@ -93,7 +92,6 @@ def read_layout(folder: Path) -> Layout:
     robot = content.get("robot_type")
     return Layout(
         folder=folder,
-        version=str(content["codebase_version"]),
         fps=_fps(info),
         robot_type=robot if isinstance(robot, str) and robot else None,
         features=features,

@@ -61,9 +61,8 @@ def write_dataset(
         StoreError: the folder exists already and is not empty, or cannot be written.
         ValueError: the arrays do not fit each other.
     """
+    _refuse_to_overwrite(folder)
     columns = _columns(features, episode_lengths, fps, tasks, timestamps)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise StoreError(f"{folder} exists already and is not empty. Give another folder, or remove it first.")
     places = _places(columns, episode_lengths, episodes_per_file, files_per_chunk)
     temporary = folder.parent / f".{folder.name}.{os.getpid()}.tmp"
     try:
@@ -72,8 +71,7 @@ def write_dataset(
         _write_data(temporary, columns, places)
         _write_episodes(temporary, columns, places, tasks)
         _write_tasks(temporary, tasks)
-        stats = {key: _listed(column_stats(values)) for key, (_, values, _) in columns.items()}
-        _write_json(temporary / "meta/stats.json", stats)
+        _write_stats(temporary, columns)
         info = _info(columns, places, fps, tasks, robot_type, files_per_chunk)
         _write_json(temporary / "meta/info.json", info | dict(extra_info or {}))
         if folder.exists():
@@ -85,6 +83,11 @@ def write_dataset(
         ) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _refuse_to_overwrite(folder: Path) -> None:
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise StoreError(f"{folder} exists already and is not empty. Give another folder, or remove it first.")
 
 
 def _columns(
@@ -239,8 +242,10 @@ def _info(
     }
 
 
-def _listed(stats: Mapping[str, np.ndarray]) -> dict[str, list[float]]:
-    return {name: numbers.tolist() for name, numbers in stats.items()}
+def _write_stats(folder: Path, columns: Mapping[str, FeatureArrays]) -> None:
+    stats = {key: column_stats(values) for key, (_, values, _) in columns.items()}
+    listed = {key: {name: numbers.tolist() for name, numbers in block.items()} for key, block in stats.items()}
+    _write_json(folder / "meta/stats.json", listed)
 
 
 def _write_json(path: Path, content: Any) -> None:

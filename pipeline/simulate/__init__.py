@@ -1,4 +1,5 @@
-"""Simulators: one a file behind one small protocol, an explicit dictionary that names them, and the roll-out that uses them.
+"""Simulators: one a file behind one small protocol, an explicit dictionary that names them, and the roll-out that
+uses them.
 
 What belongs here: the protocol, finding a simulator by name, and saying clearly when there is none for a data set. What
 does not: policies, success statistics, pictures.
@@ -78,7 +79,8 @@ def load_simulator(name: str) -> Simulator:
 
 
 def simulator_for(name: str, demos: Demonstrations, observation_set: ObservationSet) -> Simulator:
-    """The simulator of that name, once it is sure that policies of this data set and observation set can be asked in it.
+    """The simulator of that name, once it is sure that policies of this data set and observation set can be asked in
+    it.
 
     Raises:
         NotApplicableError: as `load_simulator`, or the columns do not fit.

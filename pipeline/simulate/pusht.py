@@ -1,11 +1,11 @@
 """PushT (`gym-pusht`): a round finger pushes a T-shaped block onto its outline. Positions in px of a 512 × 512 table.
 
 What belongs here: stepping many environments at once and measuring how much of the goal is covered, bit for bit as
-`PushTEnv.step` does it, about ten times faster. What does not: rendering (nothing here opens a window or draws), roll-outs,
-the scripted demonstrator.
+`PushTEnv.step` does it, about ten times faster. What does not: rendering (nothing here opens a window or draws),
+roll-outs, the scripted demonstrator.
 
-Start state n is `PushTEnv.reset(seed=n)`. The demonstrations that ship with the project start from numbers of 2³² and above
-(`pusht_demonstrator`), so that no roll-out begins where a demonstration began.
+Start state n is `PushTEnv.reset(seed=n)`. The demonstrations that ship with the project start from numbers of 2³² and
+above (`pusht_demonstrator`), so that no roll-out begins where a demonstration began.
 """
 
 import warnings
@@ -39,7 +39,7 @@ def environment_class() -> type["PushTEnv"]:
     """
     try:
         with warnings.catch_warnings():
-            # pygame asks setuptools' pkg_resources for its own fonts; which category that warns with depends on setuptools.
+            # pygame asks setuptools' pkg_resources for its fonts; the category of its warning depends on setuptools.
             warnings.filterwarnings("ignore", message="pkg_resources is deprecated")
             from gym_pusht.envs.pusht import PushTEnv
     except ImportError as error:
@@ -67,7 +67,8 @@ def make_environment(number: int) -> "PushTEnv":
 def advance(environment: "PushTEnv", x: float, y: float) -> None:
     """One frame (0.1 s) towards the target (x, y) in px: `PushTEnv.step` without its observation, reward and coverage.
 
-    The order of the arithmetic is the environment's own, on plain floats: a contact turns one different last bit into px.
+    The order of the arithmetic is the environment's own, on plain floats: a contact turns one different last bit into
+    px.
     """
     agent, space, dt = environment.agent, environment.space, environment.dt
     k_p, k_v = environment.k_p, environment.k_v
@@ -80,14 +81,15 @@ def advance(environment: "PushTEnv", x: float, y: float) -> None:
 class Coverage:
     """The share of the goal that the block covers, for many environments at once.
 
-    Equal to `PushTEnv`'s to the last bit when the two bars are taken in the same order. The environment takes them in that of
-    a Python set, which changes from process to process, and its last bit with it; here the order is fixed.
+    Equal to `PushTEnv`'s to the last bit when the two bars are taken in the same order. The environment takes them in
+    that of a Python set, which changes from process to process, and its last bit with it; here the order is fixed.
     """
 
     def __init__(self, environment: "PushTEnv"):
         import shapely
 
-        self._corners = np.array([shape.get_vertices() for shape in environment._block_shapes])  # [2, 4, 2], block frame
+        # [2, 4, 2] in the block's frame
+        self._corners = np.array([shape.get_vertices() for shape in environment._block_shapes])
         goal = environment.get_goal_pose_body(environment.goal_pose)
         self._goal = self._geometry([goal])[0]
         self._goal_area = shapely.area(self._goal)
@@ -172,8 +174,8 @@ class PushT:
             if key not in COLUMNS:
                 known = " and ".join(f"{k} ({len(names)} columns)" for k, names in COLUMNS.items())
                 return (
-                    f"{cannot}: the observation set '{observation_set.name}' needs {key}, which the simulator does not show. "
-                    f"It shows {known}; name a set of these under [datasets.{demos.name}.observations]."
+                    f"{cannot}: the observation set '{observation_set.name}' needs {key}, which the simulator does not "
+                    f"show. It shows {known}; name a set of these under [datasets.{demos.name}.observations]."
                 )
             problem = _misfit(demos, key, COLUMNS[key])
             if problem:
@@ -182,7 +184,8 @@ class PushT:
 
 
 def _misfit(demos: Demonstrations, key: str, expected: tuple[str, ...]) -> str | None:
-    """Why a feature is not what PushT calls by that key. A unit that is not known is judged by the size of the numbers."""
+    """Why a feature is not what PushT calls by that key. A unit that is not known is judged by the size of the
+    numbers."""
     wanted = f"{len(expected)} columns ({', '.join(expected)})"
     feature = demos.features.get(key)
     if feature is None:
@@ -196,6 +199,7 @@ def _misfit(demos: Demonstrations, key: str, expected: tuple[str, ...]) -> str |
     values = demos.columns[key][:, :2]
     if feature.units[0] is None and (values.min() < 0 or not 2 < values.max() <= TABLE_PX):
         return (
-            f"{key} runs from {values.min():.3g} to {values.max():.3g} and names no unit; expected px in 0 … {TABLE_PX:.0f}."
+            f"{key} runs from {values.min():.3g} to {values.max():.3g} and names no unit; "
+            f"expected px in 0 … {TABLE_PX:.0f}."
         )
     return None

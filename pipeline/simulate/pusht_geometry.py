@@ -1,7 +1,7 @@
 """The T-shaped block of PushT as plain geometry: where a finger can touch it and how to walk around it.
 
-What belongs here: points, outlines and paths in the block's own frame (px, the angle of the block taken out). What does not:
-physics, choosing a push.
+What belongs here: points, outlines and paths in the block's own frame (px, the angle of the block taken out). What
+does not: physics, choosing a push.
 
 A pose is (x px, y px, angle rad) of the block's frame, whose origin lies in the middle of the T's flat top.
 """
@@ -85,7 +85,8 @@ def length(path: list[Point]) -> float:
 
 
 def targets_along(path: list[Point], speed: float) -> list[Point]:
-    """Points along a path, evenly spaced and at most `speed` px apart, the last at its end; the first is one step in."""
+    """Points along a path, evenly spaced and at most `speed` px apart, the last at its end; the first is one step
+    in."""
     total = length(path)
     steps = max(1, math.ceil(total / speed))
     points, walked, leg = [], 0.0, 0
@@ -149,7 +150,8 @@ def walk(start: Point, goal: Point, direction: int) -> list[Point] | None:
     if first is None or last is None:
         return None
     ring = _ring()
-    around = [ring[(first + direction * k) % RING_POINTS] for k in range((direction * (last - first)) % RING_POINTS + 1)]
+    steps = (direction * (last - first)) % RING_POINTS
+    around = [ring[(first + direction * k) % RING_POINTS] for k in range(steps + 1)]
     return path[:-1] + _pull_tight([here, *around]) + [goal]
 
 

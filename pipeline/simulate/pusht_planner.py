@@ -1,12 +1,12 @@
 """Choosing a push in PushT by trying pushes in a second environment: the scripted demonstrator's judgement.
 
-What belongs here: trying straight pushes against every part of the block and choosing one. What does not: carrying them out
-and recording them (`pusht_demonstrator`), geometry (`pusht_geometry`).
+What belongs here: trying straight pushes against every part of the block and choosing one. What does not: carrying
+them out and recording them (`pusht_demonstrator`), geometry (`pusht_geometry`).
 
-Pushes are tried in an environment of the planner's own, whose bodies are set to where the recorded ones are. The recorded
-environment only ever sees the demonstration's own actions, so replaying these from the same start state gives the same
-frames, bit for bit: Chipmunk's solver remembers contacts, and trying pushes in the recorded environment would leave traces
-in that memory.
+Pushes are tried in an environment of the planner's own, whose bodies are set to where the recorded ones are. The
+recorded environment only ever sees the demonstration's own actions, so replaying these from the same start state
+gives the same frames, bit for bit: Chipmunk's solver remembers contacts, and trying pushes in the recorded
+environment would leave traces in that memory.
 """
 
 import math
@@ -33,27 +33,30 @@ from pipeline.simulate.pusht_geometry import (
 if TYPE_CHECKING:
     from gym_pusht.envs.pusht import PushTEnv
 
-WALK_SPEED_PX = 24.0
-PUSH_SPEED_PX = 12.0
+WALK_SPEED_PX = 16.0
+PUSH_SPEED_PX = 10.0
 """Px that the target moves in a frame. The finger lags about two frames behind."""
 PAUSE_FRAMES = 2
-PAUSE_BEFORE = 2
 """The target rests this long before a push and after it, so that the finger arrives."""
 ANGLE_PX = 100.0
-"""What a radian of the block's angle weighs against px of its mass centre. More than on the block's rim (60 px), so that the
-angle is put right first: a push that turns the block also moves it, one through its mass centre does not turn it."""
+"""What a radian of the block's angle weighs against px of its mass centre. More than on the block's rim (60 px), so
+that the angle is put right first: a push that turns the block also moves it, one through its mass centre does not
+turn it."""
 FRAME_PX = 0.3
 """What a frame costs: a push must bring the block this much closer for every frame it takes …"""
 NEAR_PX = 40.0
 """… and in proportion less when the block is nearer to the goal than this."""
+ANOTHER_PX = 1.5
+"""What having to push once more costs, because a push that is only thought of looks better than it is."""
 LONGEST_PUSH_PX = 140.0
 BEYOND_PX = (0.0, 1.5, 3.0)
-"""A push is tried with its last target this far beyond the place that the finger should reach: it lags, and leaves early."""
+"""A push is tried with its last target this far beyond the place that the finger should reach: it lags, and leaves
+early."""
 SHORTLIST = 8
 """Pushes that are tried in full, with the walk to them …"""
 LOOKAHEAD = 4
 """… and the best of those, which are judged by the push that could follow."""
-DETOUR = 2.5
+DETOUR = 1.5
 """The demonstrator walks around the block in its own direction unless that is this much longer than the other way."""
 MARGIN_PX = 2.0
 """Targets stay this far inside the action space."""
@@ -70,12 +73,15 @@ class State:
 
 @dataclass(frozen=True)
 class Push:
-    """A push that was tried: the frames' targets, and where it leaves the block according to the trial."""
+    """A push that was tried: the frames' targets, where it leaves the block according to the trial, and what it costs.
+
+    The first `walk_frames` targets lead to where the push begins.
+    """
 
     targets: list[Point]
     block: Pose
     cost: float
-    walk: int = 0
+    walk_frames: int
 
 
 @dataclass(frozen=True)
@@ -127,8 +133,8 @@ class Planner:
         distance, costs = self.distance(push.block), []
         for idea in self._ideas(push.block, frame_px):
             walk_px = math.dist(push.targets[-1], to_world(push.block, idea.contact.finger(STANDOFF_PX)))
-            costs.append(idea.cost + frame_px * (walk_px / WALK_SPEED_PX + (PAUSE_FRAMES+PAUSE_BEFORE)))
-        return push.cost - distance + min(distance, *costs)
+            costs.append(idea.cost + frame_px * (walk_px / WALK_SPEED_PX + 2 * PAUSE_FRAMES))
+        return push.cost - distance + min(distance, *(cost + ANOTHER_PX for cost in costs))
 
     def _ideas(self, block: Pose, frame_px: float) -> list[_Idea]:
         """A push at every contact, cheapest first."""
@@ -160,26 +166,25 @@ class Planner:
         """The same push with the walk to it, frame by frame, as the demonstrator would carry it out."""
         inwards = to_world((0.0, 0.0, state.block[2]), (-idea.contact.out_x, -idea.contact.out_y))
         standoff, end = path[-1], (idea.end[0] + beyond * inwards[0], idea.end[1] + beyond * inwards[1])
-        targets = targets_along(path, WALK_SPEED_PX) + [standoff] * PAUSE_BEFORE
-        walk_n = len(targets)
+        targets = targets_along(path, WALK_SPEED_PX) + [standoff] * PAUSE_FRAMES
+        walk_frames = len(targets)
         targets += targets_along([standoff, end], PUSH_SPEED_PX) + [end] * PAUSE_FRAMES
         targets = [_recordable(target) for target in targets]
         self._place(state)
         for target in targets:
             advance(self._trial, *target)
         block = state_of(self._trial).block
-        return Push(targets, block, self.distance(block) + frame_px * len(targets), walk_n)
+        return Push(targets, block, self.distance(block) + frame_px * len(targets), walk_frames)
 
     def _walk(self, state: State, contact: Contact) -> list[Point] | None:
-        """The way to a contact, on the table: around the block in the preferred direction unless that is a long detour."""
+        """The way to a contact, on the table: around the block in the preferred direction unless that is a long
+        detour."""
         start, goal = to_block(state.block, state.finger), contact.finger(STANDOFF_PX)
         ways = []
         for direction in (self._direction, -self._direction):
             way = walk(start, goal, direction)
             if way is not None:
-                way = [to_world(state.block, point) for point in way]
-                if all(_on_table(point) for point in way[1:]):
-                    ways.append(way)
+                ways.append([_clamped(to_world(state.block, point)) for point in way])
         if len(ways) == 2 and length(ways[0]) > DETOUR * length(ways[1]):
             return ways[1]
         return ways[0] if ways else None
@@ -204,6 +209,12 @@ def _set_pose(block, pose: Pose) -> None:
 
 def _on_table(point: Point) -> bool:
     return all(MARGIN_PX <= value <= TABLE_PX - MARGIN_PX for value in point)
+
+
+def _clamped(point: Point) -> Point:
+    """A point of a path around a block that lies close to the edge of the table."""
+    low, high = MARGIN_PX, TABLE_PX - MARGIN_PX
+    return (min(max(point[0], low), high), min(max(point[1], low), high))
 
 
 def _recordable(point: Point) -> Point:

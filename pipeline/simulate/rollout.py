@@ -3,17 +3,17 @@
 What belongs here: the loop between policy and simulator, for any simulator. What does not: physics, success intervals.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from pipeline.errors import PolicyError
 from pipeline.simulate import Environments, Simulator
-from pipeline.types import STATE, ObservationSet, Observations, Rollouts
+from pipeline.types import STATE, Observations, ObservationSet, Rollouts
 
 BATCH = 50
-"""Environments that a policy is asked for together. Fixed: the size of a batch changes the last bits of a matrix product,
-and contacts turn them into different episodes."""
+"""Environments that a policy is asked for together. Fixed: the size of a batch changes the last bits of a matrix
+product, and contacts turn them into different episodes."""
 
 
 def rollout(
@@ -27,18 +27,20 @@ def rollout(
     execute: int = 8,
     max_steps: int | None = None,
     batch: int = BATCH,
+    on_frame: Callable[[int, int], None] | None = None,
 ) -> Rollouts:
     """Ask a policy, carry out the first `execute` actions of its chunk (all where the chunk is shorter), ask again.
 
-    An environment that has succeeded stops; the others go on until `max_steps` (default: the simulator's own limit). Its row
-    stays in what the policy is asked, so every call has `batch` rows. Actions are clipped to the action space. History
-    before the first frame repeats the first frame, as in the windows a policy is trained on.
+    An environment that has succeeded stops; the others go on until `max_steps` (default: the simulator's own limit).
+    Its row stays in what the policy is asked, so every call has `batch` rows. Actions are clipped to the action
+    space. History before the first frame repeats the first frame, as in the windows a policy is trained on.
 
     Args:
         policy: `predict(Observations) -> [S, B, K, A]`; the first seed acts.
         start_states: numbers of start states (`Simulator.start`).
         name: of the policy, for the record.
         history: frames the policy is shown.
+        on_frame: called with (frames done, frames at most), over all batches.
 
     Raises:
         PolicyError: an answer has the wrong shape, or is not finite.
@@ -46,6 +48,7 @@ def rollout(
     limit = simulator.max_steps if max_steps is None else max_steps
     numbers = list(start_states)
     parts = []
+    total = limit * -(-len(numbers) // batch)
     for first in range(0, len(numbers), batch):
         block = numbers[first : first + batch]
         padded = block + [block[-1]] * (batch - len(block))
@@ -56,6 +59,8 @@ def rollout(
             for k in range(min(execute, chunk.shape[1], limit - episode.frame)):
                 if episode.running.any():
                     episode.act(chunk[:, k])
+            if on_frame:
+                on_frame(len(parts) * limit + episode.frame, total)
         parts.append({key: value[: len(block)] for key, value in episode.results().items()})
     length = max(part["paths"].shape[1] for part in parts)
     results = {key: np.concatenate([_lengthen(part[key], length, key) for part in parts]) for key in parts[0]}
@@ -89,10 +94,10 @@ class _Episode:
 
     def ask(self, policy) -> np.ndarray:
         """[R, K, A] the policy's chunk for every environment, finished ones included."""
-        values = np.stack([np.concatenate([seen[key] for key in self._features], axis=1) for seen in self._seen], axis=1)
-        empty = np.zeros((len(values), 0), dtype=np.float32)
+        shown = [np.concatenate([seen[key] for key in self._features], axis=1) for seen in self._seen]
+        empty = np.zeros((len(self.running), 0), dtype=np.float32)
         state = np.stack([seen.get(STATE, empty) for seen in self._seen], axis=1)
-        answer = np.asarray(policy.predict(Observations(values, state, self._previous.copy())))
+        answer = np.asarray(policy.predict(Observations(np.stack(shown, axis=1), state, self._previous.copy())))
         rows, columns = self._previous.shape
         if answer.ndim != 4 or answer.shape[1] != rows or answer.shape[3] != columns or 0 in answer.shape:
             raise PolicyError(

@@ -1,9 +1,10 @@
 """Pictures of single results, as PNG files: what the Dagster UI and MLflow show beside a number.
 
-What belongs here: choosing what of one result to draw. What does not: how a chart looks (`charts`), the page (`figures`).
+What belongs here: choosing what of one result to draw. What does not: how a chart looks (`charts`, `planes`), the page
+(`figures`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,14 +55,16 @@ def picture_neighbourhood(demos: Demonstrations, semantics: Semantics, floor: Ra
     _write(planes.floor_scatter(crowded.actions[:, :2], state, names=action.names[:2], unit=unit), path)
 
 
-def picture_losses(trained: "Trained", policy: str, path: Path) -> None:
-    """The loss of every seed."""
+def picture_losses(trained: "Trained", policy: str, everyone: Sequence[str], path: Path) -> None:
+    """The loss of every seed. `everyone` names all policies: they decide on the colour of this one."""
     from pipeline.sinks import charts
 
-    _write(charts.loss_curves(trained.steps_logged, trained.losses, policy=policy), path)
+    _write(charts.loss_curves(trained.steps_logged, trained.losses, policy=policy, everyone=everyone), path)
 
 
-def picture_horizons(metrics: Mapping[str, Any], policy: str, demos: Demonstrations, path: Path) -> None:
+def picture_horizons(
+    metrics: Mapping[str, Any], policy: str, everyone: Sequence[str], demos: Demonstrations, path: Path
+) -> None:
     """A policy's error at every horizon beside hold-still's."""
     from pipeline.sinks import charts
 
@@ -69,7 +72,7 @@ def picture_horizons(metrics: Mapping[str, Any], policy: str, demos: Demonstrati
     if policy != "hold_still":
         curves["hold_still"] = metrics["hold_still_by_horizon"]
     unit = common_unit(demos.features[ACTION].units)
-    _write(charts.error_over_horizon(curves, fps=demos.fps, unit=unit), path)
+    _write(charts.error_over_horizon(curves, fps=demos.fps, unit=unit, everyone=everyone), path)
 
 
 def picture_table(table: Mapping[str, Any], path: Path) -> None:

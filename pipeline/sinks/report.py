@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.policies import METHODS
 from pipeline.sinks import explanations, replacing
 from pipeline.sinks.markup import Html, element, join, json_for_script, script_text
 from pipeline.sinks.page_style import draw_script, style_sheet, themed
@@ -132,32 +133,36 @@ def _dotted(parts: Sequence[str]) -> list[Html]:
 def _in_short(table: Table) -> Html | None:
     """The answer in a sentence or two, before the table."""
     rows = [row for row in table["policies"] if row["first_step_mae"] is not None]
+    driven = [row for row in table["policies"] if row["rollouts"]]
     if not rows:
         return None
     unit = common_unit(table["dataset"]["action_units"]) or ""
+    return element("p", _best_offline(rows, unit), _best_driven(driven) if driven else None, class_="short")
+
+
+def _best_offline(rows: Sequence[Mapping[str, Any]], unit: str) -> Html:
     best = min(rows, key=lambda row: row["first_step_mae"])
     interval = show_interval((best.get("interval") or {}).get("first_step_mae"))
-    said = [
-        "The lowest first-step error is that of ", element("b", best["policy"]), f" seeing {best['observations']}: ",
-        element("b", f"{show(best['first_step_mae'])} {unit}".strip()), f" {interval}" if interval else "",
-    ]  # fmt: skip
-    if best["vs_hold_still"] is not None and best["method"] != "hold_still":
-        said.append(f", {show(best['vs_hold_still'])} × smaller than holding still")
-    said.append(". ")
-    driven = [row for row in rows if row["rollouts"]]
-    if driven:
-        most = max(driven, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]))
-        n, rate, interval = most["rollouts"]["n"], most["rollouts"]["success"], most["rollouts"].get("success_interval")
-        said += [
-            "In closed loop ",
-            element("b", most["policy"]),
-            f" seeing {most['observations']} succeeds most often: ",
-        ]
-        said += [
-            element("b", f"{round(rate * n)} of {n}"),
-            f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f} %)." if interval else ".",
-        ]
-    return element("p", said, class_="short")
+    ratio = best["vs_hold_still"]
+    value = element("b", f"{show(best['first_step_mae'])} {unit}".strip())
+    than_still = f", {show(ratio)} × smaller than holding still" if ratio is not None and ratio > 1 else ""
+    return join(
+        "The lowest first-step error is that of ", _who(best), ": ", value, f" {interval}".rstrip(), than_still, ". "
+    )
+
+
+def _best_driven(rows: Sequence[Mapping[str, Any]]) -> Html:
+    most = max(rows, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]))
+    n, rate, interval = most["rollouts"]["n"], most["rollouts"]["success"], most["rollouts"].get("success_interval")
+    count = element("b", f"{round(rate * n)} of {n}")
+    percent = f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f} %)" if show_interval(interval) else ""
+    return join("In closed loop ", _who(most), " succeeds most often: ", count, percent, ".")
+
+
+def _who(row: Mapping[str, Any]) -> Html:
+    """A policy, and what it sees if its answer depends on that."""
+    sees = row["method"] not in METHODS or METHODS[row["method"]].uses_observations
+    return join(element("b", row["policy"]), f" seeing {row['observations']}" if sees else None)
 
 
 def _notes(table: Table) -> Html:

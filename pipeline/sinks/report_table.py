@@ -80,7 +80,7 @@ def _columns(table: Mapping[str, Any]) -> list[Column]:
         *columns,
         Column("Params", "one net", lambda row: row["params"], None, lambda row, _: _count(row["params"])),
         Column("Training", "s", lambda row: row["train_s"], None, lambda row, _: _seconds(row["train_s"])),
-        Column("Latency", "ms a call", lambda row: row["latency_ms"], decimals=2),
+        Column("Latency", "ms a call", lambda row: row["latency_ms"], decimals=3),
     ]
 
 
@@ -113,19 +113,22 @@ def _of(row: Row, key: str) -> float | None:
 
 
 def _scale(rows: Sequence[Row]) -> float:
-    """The error at the right end of the small interval pictures: a little above hold-still or what beats it."""
-    errors = [row["first_step_mae"] for row in rows if is_number(row["first_step_mae"])]
-    still = [
-        row["first_step_mae"] for row in rows if row["policy"] == "hold_still" and is_number(row["first_step_mae"])
+    """The right end of the small interval pictures. Constants such as the mean action may lie beyond it."""
+    leading = [row for row in rows if row["policy"] not in ("mean_action", "constant_velocity")] or rows
+    highs = [
+        max(row["first_step_mae"], *(_interval(row) or (0.0,))) for row in leading if is_number(row["first_step_mae"])
     ]
-    if not errors:
-        return 1.0
-    return 1.25 * (still[0] if still else sorted(errors)[len(errors) // 2]) or 1.0
+    return 1.08 * max(highs, default=0.0) or 1.0
+
+
+def _interval(row: Row) -> Sequence[float] | None:
+    interval = (row.get("interval") or {}).get("first_step_mae")
+    return interval if show_interval(interval) else None
 
 
 def _with_interval(row: Row, shown: str, scale: float) -> Html:
     """The error, its interval, and both as a small picture on an axis from zero that all rows share."""
-    interval = (row.get("interval") or {}).get("first_step_mae")
+    interval = _interval(row)
     decimals = len(shown.partition(".")[2])
     text = show_interval(interval, decimals)
     low, high = interval if text else (row["first_step_mae"],) * 2

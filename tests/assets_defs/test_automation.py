@@ -54,7 +54,10 @@ def test_the_schedule_asks_for_what_is_stale_and_skips_when_nothing_is(fresh, fi
 
 
 def test_policies_that_must_be_named_are_not_in_the_jobs(fresh):
-    raw = {**TINY, "policies": {**TINY["policies"], "notebook_pusht": {"method": "notebook_pusht", "only_when_named": True}}}
+    raw = {
+        **TINY,
+        "policies": {**TINY["policies"], "notebook_pusht": {"method": "notebook_pusht", "only_when_named": True}},
+    }
     benchmark = TinyBenchmark(fresh.folder, fresh.store, raw)
     job = benchmark.defs().resolve_job_def("benchmark")
     keys = {key.to_user_string() for key in job.asset_layer.executable_asset_keys}

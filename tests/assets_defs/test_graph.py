@@ -51,7 +51,9 @@ def test_the_table_has_every_policy_and_honest_numbers(finished):
     predicted = load_predictions(finished.plan().folder(Unit("mlp_k01/predictions", "state")))
     recorded = np.load(finished.plan().folder(Unit("demonstrations")) / "frames" / "column-000.npy")
     episodes = [
-        np.mean([np.abs(predicted.actions[:, m, 0] - recorded[t]) for m, t in enumerate(predicted.anchors) if t // 30 == e])
+        np.mean(
+            [np.abs(predicted.actions[:, m, 0] - recorded[t]) for m, t in enumerate(predicted.anchors) if t // 30 == e]
+        )
         for e in range(6)
     ]
     assert rows["mlp_k01"]["first_step_mae"] == pytest.approx(np.mean(episodes), rel=1e-5)

@@ -248,3 +248,11 @@ def test_the_stamp_is_the_commit_now_and_the_cached_one_out_of_reach(
 def test_a_folder_inside_the_cache_can_be_given_as_a_folder(hub: Hub, folder: Path):
     hub.push(NAME, folder)
     assert load(str(fetch(NAME).folder)).episodes == 6
+
+
+@pytest.mark.parametrize("address", ["nowhere", "ftp://host", "http://host:port", "http://user:hunter2@"])
+def test_an_endpoint_that_is_no_address(hub: Hub, monkeypatch: pytest.MonkeyPatch, address: str):
+    monkeypatch.setenv("HF_ENDPOINT", address)
+    with pytest.raises(HubError, match="HF_ENDPOINT is not the address of a Hub") as caught:
+        fetch(NAME)
+    assert "hunter2" not in str(caught.value)

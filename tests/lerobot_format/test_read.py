@@ -13,11 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.lerobot_format.read import (
-    load_demonstrations,
-    load_source,
     read_dataset,
-    save_demonstrations,
-    source_stamp,
 )
 from pipeline.types import ACTION, STATE, Camera
 from tests.makers import Recording, demonstrations_of, edit_info, edit_table, tiny_recording, write_v2, write_v3
@@ -254,83 +250,6 @@ def test_a_newer_version_3_is_read_with_a_warning(tmp_path: Path, recording: Rec
     folder = write_v3(tmp_path / "set", recording)
     edit_info(folder, lambda info: info.update(codebase_version="v3.2"))
     assert "v3.2" in read_dataset(folder, name="set").warnings[0]
-
-
-# The hash
-
-
-def test_the_hash_sees_every_change(recording: Recording):
-    def value(key: str) -> dict:
-        names, values, dtype = recording.features[key]
-        changed = values.copy()
-        changed[-1, -1] = not changed[-1, -1] if dtype == "bool" else np.nextafter(changed[-1, -1], np.float32(9))
-        return recording.features | {key: (names, changed, dtype)}
-
-    renamed = recording.features | {ACTION: (("a", "b"), *recording.features[ACTION][1:])}
-    changes = [
-        recording,
-        replace(recording, features=value(ACTION)),
-        replace(recording, features=value(STATE)),
-        replace(recording, features=value("next.done")),
-        replace(recording, features=renamed),
-        replace(recording, lengths=(30, 12, 25, 39, 19)),
-        replace(recording, tasks=("push", "pull", "push", "push", "push")),
-        replace(recording, fps=20.0),
-        replace(recording, features={key: column for key, column in recording.features.items() if key != "next.done"}),
-    ]
-    hashes = [demonstrations_of(change).content_hash for change in changes]
-    assert len(set(hashes)) == len(changes)
-    assert demonstrations_of(recording, name="another").content_hash == hashes[0]
-
-
-# Kept between runs
-
-
-def test_kept_demonstrations_come_back_mapped(tmp_path: Path, recording: Recording):
-    folder = write_v2(tmp_path / "set", recording)
-    read = read_dataset(folder, name="set", source="hub:a/b", revision="0" * 40)
-    save_demonstrations(read, tmp_path / "kept")
-    back = load_demonstrations(tmp_path / "kept")
-    for field in (
-        "name",
-        "source",
-        "revision",
-        "fps",
-        "robot_type",
-        "features",
-        "tasks",
-        "cameras",
-        "warnings",
-        "content_hash",
-    ):
-        assert getattr(back, field) == getattr(read, field)
-    for key in read.columns:
-        assert isinstance(back.columns[key], np.memmap)
-        np.testing.assert_array_equal(back.columns[key], read.columns[key])
-    np.testing.assert_array_equal(back.timestamps, read.timestamps)
-    np.testing.assert_array_equal(back.episode_starts, read.episode_starts)
-    assert back.frames == read.frames
-
-
-# Sources and their stamps
-
-
-def test_a_folder_is_relative_to_the_configuration(tmp_path: Path, recording: Recording):
-    folder = write_v3(tmp_path / "sets/one", recording)
-    read = load_source("sets/one", name="one", config_dir=tmp_path)
-    assert read.source == "sets/one"
-    assert load_source(str(folder), name="one", config_dir=Path("/nowhere")).content_hash == read.content_hash
-
-
-def test_the_stamp_of_a_folder_changes_when_a_file_does(tmp_path: Path, recording: Recording):
-    folder = write_v3(tmp_path / "set", recording)
-    stamp = source_stamp("set", tmp_path)
-    assert stamp["kind"] == "folder"
-    assert json.loads(json.dumps(stamp)) == stamp == source_stamp(str(folder), Path("/nowhere"))
-    (folder / "README.md").write_text("words do not matter")
-    assert source_stamp("set", tmp_path) == stamp
-    edit_info(folder, lambda info: info.update(robot_type="another"))
-    assert source_stamp("set", tmp_path) != stamp
 
 
 # The real ones

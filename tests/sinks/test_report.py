@@ -39,7 +39,7 @@ def scripts_of(page: str) -> list[tuple[str, str]]:
 
 def test_the_table_comes_first_and_holds_the_numbers(table, figures):
     page = text_of(render_report(table, figures, PROVENANCE))
-    assert "mlp_k01 state state 4.50 [4.05, 4.95] 5.62 – – 4.44 0.0450 – – 275,462 12 0.12" in page
+    assert "mlp_k01 state state 4.50 [4.05, 4.95] 5.62 – – 4.44 0.0450 – – 275,462 12 0.120" in page
     assert "mlp_k04 state state 5.50 [4.95, 6.05] 6.88 – – 3.64 0.0550 41/50 69–91 % 0.934" in page
     assert page.index("275,462") < page.index("How fast does the error grow")
     heads = "First-step MAE px, 95 % interval RMSE px At 1 s MAE, px Whole chunk MAE, px × hold-still ratio Scaled"
@@ -61,6 +61,13 @@ def test_the_answer_is_in_a_sentence(table, figures):
     page = text_of(render_report(table, figures, PROVENANCE))
     assert "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]" in page
     assert "mlp_k04 seeing state succeeds most often: 41 of 50 (69–91 %)." in page
+
+
+def test_the_sentence_names_no_observations_where_they_do_not_matter(table, figures):
+    table["policies"][-1]["first_step_mae"] = 1.0
+    page = text_of(render_report(table, figures, PROVENANCE))
+    assert "The lowest first-step error is that of hold_still : 1.00 px" in page
+    assert "smaller than holding still" not in page
 
 
 def test_what_does_not_apply_is_said_once(demos, semantics, table):

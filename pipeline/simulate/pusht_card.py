@@ -1,0 +1,115 @@
+"""The card of a recorded PushT data set: how it was made, in words and numbers that the recording itself produced.
+
+What belongs here: the record of a recording and its README. What does not: recording.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+
+class _Recorded(Protocol):
+    strategy: int
+    action: np.ndarray
+
+
+@dataclass(frozen=True)
+class Recording:
+    """How a data set came about. `frames_median` and the range are frames an episode; `interval` is Clopper–Pearson,
+    95 %."""
+
+    seed: int
+    episodes: int
+    frames: int
+    frames_shortest: int
+    frames_median: float
+    frames_longest: int
+    attempts: int
+    failures: int
+    interval: tuple[float, float]
+    episodes_by_strategy: tuple[int, int]
+    versions: Mapping[str, str]
+
+    @classmethod
+    def of(cls, kept: Sequence[_Recorded], *, seed: int, attempts: int, versions: Mapping[str, str]) -> "Recording":
+        from scipy.stats import binomtest
+
+        interval = binomtest(len(kept), attempts).proportion_ci(0.95, method="exact")
+        lengths = [len(demonstration.action) for demonstration in kept]
+        clockwise = sum(demonstration.strategy for demonstration in kept)
+        return cls(
+            seed=seed,
+            episodes=len(kept),
+            frames=sum(lengths),
+            frames_shortest=min(lengths),
+            frames_median=float(np.median(lengths)),
+            frames_longest=max(lengths),
+            attempts=attempts,
+            failures=attempts - len(kept),
+            interval=(round(float(interval.low), 4), round(float(interval.high), 4)),
+            episodes_by_strategy=(len(kept) - clockwise, clockwise),
+            versions=dict(versions),
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def card(recording: Recording) -> str:
+    """README.md for the data set's folder."""
+    r = recording
+    versions = ", ".join(f"{name} {version}" for name, version in r.versions.items())
+    left_out = f"{r.failures} failed attempt{'s were' if r.failures != 1 else ' was'} left out"
+    success = f"{r.episodes} of {r.attempts} = {r.episodes / r.attempts:.3f}"
+    success += f", 95 % interval {r.interval[0]:.3f} … {r.interval[1]:.3f} (Clopper–Pearson); {left_out}"
+    return f"""---
+license: apache-2.0
+task_categories: [robotics]
+tags: [LeRobot, PushT, simulated]
+---
+# PushT, demonstrated by a planner
+
+**Simulated.** {r.episodes} demonstrations, {r.frames:,} frames at 10 Hz, in LeRobot v3.0 format: a round finger
+pushes a T-shaped block onto its outline on a table of 512 × 512 px. No person and no robot took part.
+
+Made by `demobench record pusht OUT --episodes {r.episodes} --seed {r.seed}` with {versions}. The same command with
+the same versions makes the same content again; other versions of the physics make other demonstrations.
+
+| | |
+|---|---|
+| attempts | {r.attempts}, from start states `PushTEnv.reset(seed=n)`, n = {(1 + r.seed) << 32} + 0 … {r.attempts - 1} |
+| success of the demonstrator | {success} |
+| frames an episode | {r.frames_shortest} … {r.frames_longest}, median {r.frames_median:g} |
+| episodes by strategy | {r.episodes_by_strategy[0]} anticlockwise (0), {r.episodes_by_strategy[1]} clockwise (1) |
+
+## How the demonstrator works
+It tries straight pushes against every part of the block in a second environment that it keeps for the purpose, judges
+each by where it leaves the block, by the frames it takes and by the best push that could follow, carries the best one
+out, and chooses again. Its hand is unsteady: a drifting error is added to where it aims, more on the way to a push
+than while pushing. The recorded actions are the ones that were carried out: replayed from the same start state they
+give the same frames.
+
+**Two strategies**, drawn for each episode: to reach the other side of the block, it prefers to walk around it
+clockwise or anticlockwise (as the table is usually drawn, y downwards), unless that is much longer. So the same
+observation is answered in two ways, and the best deterministic policy is worse than the demonstrator. The column
+`strategy` reveals which.
+
+An episode ends when more than 95 % of the outline is covered, at most 300 steps after it began.
+
+## Columns
+| key | what it is |
+|---|---|
+| `observation.state` | finger: x_px, y_px |
+| `observation.environment_state` | block: block_x_px, block_y_px, block_angle_rad (0 … 2π, wraps) |
+| `action` | where the finger is told to go: x_px, y_px; at a frame's own observation |
+| `next.coverage` | share of the outline that is covered after the action |
+| `next.reward` | min(1, coverage / 0.95) |
+| `next.success` | coverage above 0.95 |
+| `next.done` | true at the last frame of an episode |
+| `strategy` | 0 anticlockwise, 1 clockwise; hidden from policies unless they are given it |
+
+The last frame of an episode shows the success; nothing was carried out there, and its action and `next.*` repeat
+those of the frame before.
+"""

@@ -1,0 +1,209 @@
+"""The scripted demonstrator of PushT, and the recording of its demonstrations as a LeRobot data set.
+
+What belongs here: carrying pushes out with an unsteady hand, keeping what succeeded, writing it down. What does not:
+choosing pushes (`pusht_planner`), the words of the card (`pusht_card`).
+
+Same seed, same demonstrations, whatever the number of processes: an attempt depends on its number only.
+"""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from itertools import count
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import StoreError
+from pipeline.lerobot_format.write import write_dataset
+from pipeline.simulate.pusht import (
+    BLOCK,
+    COLUMNS,
+    FPS,
+    MAX_STEPS,
+    SUCCESS_COVERAGE,
+    TABLE_PX,
+    Coverage,
+    advance,
+    environment_class,
+    make_environment,
+    pose_columns,
+    reward_of,
+    versions,
+)
+from pipeline.simulate.pusht_card import Recording, card
+from pipeline.simulate.pusht_planner import MARGIN_PX, Planner, state_of
+from pipeline.types import ACTION, STATE
+
+TASK = "Push the T-shaped block onto its outline."
+STRATEGIES = {0: -1, 1: +1}
+"""The `strategy` column → which way around the block the demonstrator prefers to walk (+1: as the block's angle
+grows)."""
+HAND_WALK_PX, HAND_PUSH_PX = 8.0, 1.0
+"""Standard deviation of the hand's unsteadiness, in each of x and y, on the way to a push and while pushing.
+Demonstrations that never stray teach nothing about getting back."""
+HAND_MEMORY = 0.8
+"""How much of it is left after a frame."""
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One successful episode of n frames. The last frame shows the success; its action repeats the one before it.
+
+    finger, action [n, 2] px · block [n, 3] px, px, rad · coverage [n] after the frame's action; float32
+    """
+
+    number: int
+    strategy: int
+    finger: np.ndarray
+    block: np.ndarray
+    action: np.ndarray
+    coverage: np.ndarray
+
+
+def start_number(seed: int, attempt: int) -> int:
+    """The start state of an attempt: 2³² and above, where no roll-out begins."""
+    return ((1 + seed) << 32) + attempt
+
+
+def demonstrate(number: int) -> Demonstration | None:
+    """Attempt start state `number`; None where the block does not get home within 300 steps."""
+    environment = make_environment(number)
+    coverage_of = Coverage(environment)
+    random = np.random.default_rng([number, 1])
+    strategy = int(random.integers(2))
+    planner, hand = Planner(STRATEGIES[strategy]), _Hand(random)
+    poses, actions, coverage = [pose_columns([environment])], [], []
+    while len(actions) < MAX_STEPS:
+        push = planner.next_push(state_of(environment))
+        if push is None:
+            return None
+        for k, target in enumerate(push.targets[: MAX_STEPS - len(actions)]):
+            action = hand.move(target, HAND_WALK_PX if k < push.walk_frames - 1 else HAND_PUSH_PX)
+            advance(environment, float(action[0]), float(action[1]))
+            actions.append(action)
+            coverage.append(coverage_of([environment])[0])
+            poses.append(pose_columns([environment]))
+            if coverage[-1] > SUCCESS_COVERAGE:
+                return Demonstration(
+                    number,
+                    strategy,
+                    np.concatenate([pose[STATE] for pose in poses]),
+                    np.concatenate([pose[BLOCK] for pose in poses]),
+                    np.stack([*actions, actions[-1]]),
+                    np.array([*coverage, coverage[-1]], dtype=np.float32),
+                )
+    return None
+
+
+class _Hand:
+    """Aims where it is told to, give or take a drifting error (a first-order autoregression of unit variance)."""
+
+    def __init__(self, random: np.random.Generator):
+        self._random = random
+        self._error = random.standard_normal(2)
+
+    def move(self, target: tuple[float, float], unsteadiness_px: float) -> np.ndarray:
+        """[2] float32, the action: what is recorded is what is carried out."""
+        fresh = self._random.standard_normal(2)
+        self._error = HAND_MEMORY * self._error + (1 - HAND_MEMORY**2) ** 0.5 * fresh
+        aimed = np.asarray(target) + unsteadiness_px * self._error
+        return np.clip(aimed, MARGIN_PX, TABLE_PX - MARGIN_PX).astype(np.float32)
+
+
+def record_pusht(
+    out: Path,
+    *,
+    episodes: int = 200,
+    seed: int = 0,
+    workers: int = 2,
+    on_episode: Callable[[int, int], None] | None = None,
+) -> None:
+    """Record demonstrations into a new folder `out`, with a card that says how they were made.
+
+    Attempts are made in order until `episodes` of them have succeeded; the others are left out and counted.
+
+    Args:
+        workers: processes; the demonstrations do not depend on it.
+        on_episode: called with (recorded, wanted) after every demonstration.
+
+    Raises:
+        NotApplicableError: gym-pusht is not installed.
+        StoreError: `out` exists, or cannot be written.
+    """
+    environment_class()
+    out = out.absolute()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise StoreError(f"{out} exists already and is not empty. Give another folder, or remove it first.")
+    kept: list[Demonstration] = []
+    attempts = _attempts(seed, workers)
+    tried = 0
+    while len(kept) < episodes:
+        demonstration = next(attempts)
+        tried += 1
+        if demonstration is not None:
+            kept.append(demonstration)
+            if on_episode:
+                on_episode(len(kept), episodes)
+    attempts.close()
+    _write(out, kept, Recording.of(kept, seed=seed, attempts=tried, versions=versions()))
+
+
+def _attempts(seed: int, workers: int) -> Iterator[Demonstration | None]:
+    """Attempts 0, 1, 2 … in order, a few ahead of what is asked for when there are several processes."""
+    numbers = (start_number(seed, attempt) for attempt in count())
+    if workers == 1:
+        yield from map(demonstrate, numbers)
+    # A forked process would inherit threads of whoever calls (torch, Dagster) in the middle of what they were doing.
+    executor = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+    try:
+        ahead: list[Future] = [executor.submit(demonstrate, next(numbers)) for _ in range(2 * workers)]
+        while True:
+            yield ahead.pop(0).result()
+            ahead.append(executor.submit(demonstrate, next(numbers)))
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _write(out: Path, kept: list[Demonstration], recording: Recording) -> None:
+    """Data, card and `meta/recording.json` under a temporary name beside `out`, then renamed."""
+    draft = out.parent / f".{out.name}.recording"
+    shutil.rmtree(draft, ignore_errors=True)
+    try:
+        write_dataset(
+            draft,
+            fps=FPS,
+            features=features_of(kept),
+            episode_lengths=[len(demonstration.action) for demonstration in kept],
+            tasks=[TASK] * len(kept),
+            robot_type="pusht_pusher",
+        )
+        (draft / "README.md").write_text(card(recording), encoding="utf-8")
+        (draft / "meta" / "recording.json").write_text(json.dumps(recording.as_dict(), indent=2) + "\n")
+        if out.exists():
+            out.rmdir()
+        draft.rename(out)
+    except OSError as error:
+        raise StoreError(f"{out} cannot be written: {error.strerror or error}. Choose another folder.") from None
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def features_of(kept: list[Demonstration]) -> dict[str, tuple[tuple[str, ...] | None, np.ndarray, str]]:
+    """Feature key → names, [N, D] values, dtype, as the writer takes them. All but `strategy` have LeRobot's usual
+    names."""
+    lengths = [len(demonstration.action) for demonstration in kept]
+    coverage = np.concatenate([demonstration.coverage for demonstration in kept])
+    return {
+        STATE: (COLUMNS[STATE], np.concatenate([demonstration.finger for demonstration in kept]), "float32"),
+        BLOCK: (COLUMNS[BLOCK], np.concatenate([demonstration.block for demonstration in kept]), "float32"),
+        ACTION: (COLUMNS[STATE], np.concatenate([demonstration.action for demonstration in kept]), "float32"),
+        "next.coverage": (None, coverage[:, None], "float32"),
+        "next.reward": (None, reward_of(coverage)[:, None], "float32"),
+        "next.success": (None, (coverage > SUCCESS_COVERAGE)[:, None], "bool"),
+        "next.done": (None, np.concatenate([np.arange(n) == n - 1 for n in lengths])[:, None], "bool"),
+        "strategy": (None, np.repeat([d.strategy for d in kept], lengths)[:, None], "int64"),
+    }
