@@ -13,6 +13,7 @@ A policy owns its transform, and its arrays hold it. `METHODS` holds what the re
 without importing torch; files are written and read by `pipeline.train`.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -20,6 +21,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+
+# PyTorch's threads wait for each other by spinning, and where other work wants the cores (a second run, the UI, a browser)
+# they spin away the time of the thread they wait for: five times slower steps were measured. OpenMP reads this once, when
+# PyTorch is first imported, and every module that imports it here comes after this one.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 @dataclass(frozen=True)
