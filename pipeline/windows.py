@@ -6,7 +6,7 @@ learning anything. Frames are never copied for a whole data set: memory is O(fra
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -98,13 +98,13 @@ class Windows:
         previous = np.array(actions[np.maximum(anchors - 1, 0)])
         previous[anchors == self.first_frame[index]] = np.nan
         states = self.demos.columns.get(STATE)
-        state = np.empty((*frames.shape, 0), np.float32) if states is None else states[frames]
-        return Observations(self.values[frames], state, previous, anchors)
+        state = np.empty((*frames.shape, 0), np.float32) if states is None else rows(states, frames)
+        return Observations(rows(self.values, frames), state, previous, anchors)
 
     def targets(self, index: np.ndarray | slice | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The recorded actions [B, K, A], and a mask [B, K]: False past the end, where an action means nothing."""
         frames, mask = self.target_frames(index)
-        return self.demos.columns[ACTION][frames], mask
+        return rows(self.demos.columns[ACTION], frames), mask
 
     def hash(self) -> str:
         """sha256 over all that learning from these windows can see, and nothing else."""
@@ -131,13 +131,18 @@ class Windows:
         }
 
 
+def rows(values: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """`values[frames]`, [N, D] at [B, …] → [B, …, D]; `take` is an order of magnitude faster than the brackets."""
+    return np.take(np.asarray(values), frames, axis=0)
+
+
 def make_windows(
     demos: Demonstrations,
     semantics: Semantics,
     observation_set: ObservationSet,
-    episodes: Sequence[int],
+    episodes: Collection[int],
     *,
-    statistics_episodes: Sequence[int],
+    statistics_episodes: Collection[int],
     protocol: Protocol,
     history: int,
     chunk: int,
@@ -166,28 +171,23 @@ def make_windows(
     everywhere = protocol == "notebook" and recipe == "every_frame"
     first = 0 if everywhere else history - 1
     cut = chunk if protocol == "notebook" and not everywhere else 0
-    spans = [demos.episode(e) for e in sorted(episodes)]
-    anchors = [np.arange(span.start + first, span.stop - cut, dtype=np.int64) for span in spans]
-    anchors = np.concatenate(anchors) if anchors else np.empty(0, np.int64)
+    anchors = _anchors(demos, sorted(episodes), first, cut)
     if not len(anchors):
         raise DatasetError(
-            f"No window of {history} frames and {chunk} actions fits into the {len(spans)} episodes asked for of "
+            f"No window of {history} frames and {chunk} actions fits into the {len(episodes)} episodes asked for of "
             f"'{demos.name}'. Ask for a smaller chunk or a shorter history."
         )
     own = 1 if recipe == "every_frame" else own_history or history
     statistics = range(demos.episodes) if protocol == "notebook" else sorted(statistics_episodes)
-    return Windows(
-        demos=demos,
-        semantics=semantics,
-        observation_set=observation_set,
-        episodes=tuple(sorted(episodes)),
-        statistics_episodes=tuple(statistics),
-        protocol=protocol,
-        recipe=recipe,
-        history=own,
-        chunk=chunk,
-        anchors=anchors,
-    )
+    parts = (tuple(sorted(episodes)), tuple(statistics))
+    return Windows(demos, semantics, observation_set, *parts, protocol, recipe, own, chunk, anchors)
+
+
+def _anchors(demos: Demonstrations, episodes: Sequence[int], first: int, cut: int) -> np.ndarray:
+    """[M] the frames of episodes less the `first` ones and the last `cut` of each."""
+    spans = [demos.episode(episode) for episode in episodes]
+    anchors = [np.arange(span.start + first, span.stop - cut, dtype=np.int64) for span in spans]
+    return np.concatenate([np.empty(0, np.int64), *anchors])
 
 
 def _check_features(demos: Demonstrations, observation_set: ObservationSet) -> None:

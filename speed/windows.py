@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.types import ACTION
-from pipeline.windows import Windows
+from pipeline.windows import Windows, rows
 from speed.timing import compare, peak_mb
 
 BATCH = 4096
@@ -14,7 +14,7 @@ def gathered(windows: Windows) -> float:
     total = 0.0
     for start in range(0, len(windows), BATCH):
         index = slice(start, start + BATCH)
-        seen = windows.values[windows.history_frames(index)]
+        seen = rows(windows.values, windows.history_frames(index))
         actions, mask = windows.targets(index)
         total += float(seen[0, 0, 0]) + float(actions[0, 0, 0]) + float(mask[0, 0])
     return total

@@ -1,7 +1,7 @@
 """PushT (`gym-pusht`): a round finger pushes a T-shaped block onto its outline. Positions in px of a 512 × 512 table.
 
 What belongs here: stepping many environments at once and measuring how much of the goal is covered, bit for bit as
-`PushTEnv.step` does it, about ten times faster. What does not: rendering (nothing here opens a window or draws),
+`PushTEnv.step` does it, several times faster. What does not: rendering (nothing here opens a window or draws),
 roll-outs, the scripted demonstrator.
 
 Start state n is `PushTEnv.reset(seed=n)`. The demonstrations that ship with the project start from numbers of 2³² and

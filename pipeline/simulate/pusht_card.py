@@ -60,41 +60,51 @@ class Recording:
 def card(recording: Recording) -> str:
     """README.md for the data set's folder."""
     r = recording
-    versions = ", ".join(f"{name} {version}" for name, version in r.versions.items())
+    rate = f"{r.episodes} of {r.attempts} = {r.episodes / r.attempts:.3f}"
+    interval = f"95 % interval {r.interval[0]:.3f} … {r.interval[1]:.3f} (Clopper–Pearson)"
     left_out = f"{r.failures} failed attempt{'s were' if r.failures != 1 else ' was'} left out"
-    success = f"{r.episodes} of {r.attempts} = {r.episodes / r.attempts:.3f}"
-    success += f", 95 % interval {r.interval[0]:.3f} … {r.interval[1]:.3f} (Clopper–Pearson); {left_out}"
-    return f"""---
+    first = (1 + r.seed) << 32
+    return _CARD.format(
+        **r.as_dict(),
+        made_with=", ".join(f"{name} {version}" for name, version in r.versions.items()),
+        starts=f"n = {first:,} … {first + r.attempts - 1:,}",
+        success=f"{rate}, {interval}; {left_out}",
+        anticlockwise=r.episodes_by_strategy[0],
+        clockwise=r.episodes_by_strategy[1],
+    )
+
+
+_CARD = """---
 license: apache-2.0
 task_categories: [robotics]
 tags: [LeRobot, PushT, simulated]
 ---
 # PushT, demonstrated by a planner
 
-**Simulated.** {r.episodes} demonstrations, {r.frames:,} frames at 10 Hz, in LeRobot v3.0 format: a round finger
-pushes a T-shaped block onto its outline on a table of 512 × 512 px. No person and no robot took part.
+**Simulated.** {episodes} demonstrations, {frames:,} frames at 10 Hz, in LeRobot v3.0 format: a round finger pushes a
+T-shaped block onto its outline on a table of 512 × 512 px. No person and no robot took part.
 
-Made by `demobench record pusht OUT --episodes {r.episodes} --seed {r.seed}` with {versions}. The same command with
-the same versions makes the same content again; other versions of the physics make other demonstrations.
+Made by `demobench record pusht OUT --episodes {episodes} --seed {seed}` with {made_with}.
+The same command with the same versions makes the same content again; another version of the physics makes other
+demonstrations.
 
 | | |
 |---|---|
-| attempts | {r.attempts}, from start states `PushTEnv.reset(seed=n)`, n = {(1 + r.seed) << 32} + 0 … {r.attempts - 1} |
+| attempts | {attempts}, from start states `PushTEnv.reset(seed=n)`, {starts} |
 | success of the demonstrator | {success} |
-| frames an episode | {r.frames_shortest} … {r.frames_longest}, median {r.frames_median:g} |
-| episodes by strategy | {r.episodes_by_strategy[0]} anticlockwise (0), {r.episodes_by_strategy[1]} clockwise (1) |
+| frames an episode | {frames_shortest} … {frames_longest}, median {frames_median:g} |
+| episodes by strategy | {anticlockwise} anticlockwise (0), {clockwise} clockwise (1) |
 
 ## How the demonstrator works
-It tries straight pushes against every part of the block in a second environment that it keeps for the purpose, judges
-each by where it leaves the block, by the frames it takes and by the best push that could follow, carries the best one
-out, and chooses again. Its hand is unsteady: a drifting error is added to where it aims, more on the way to a push
-than while pushing. The recorded actions are the ones that were carried out: replayed from the same start state they
-give the same frames.
+It tries straight pushes against a dozen places on the block in a second environment that it keeps for the purpose,
+judges each by where it leaves the block, by the frames it takes and by the best push that could follow, carries the
+best one out, and chooses again. Its hand is unsteady: a drifting error is added to where it aims, more on the way to a
+push than while pushing. The recorded actions are the ones that were carried out: replayed from the same start state
+they give the same frames.
 
-**Two strategies**, drawn for each episode: to reach the other side of the block, it prefers to walk around it
-clockwise or anticlockwise (as the table is usually drawn, y downwards), unless that is much longer. So the same
-observation is answered in two ways, and the best deterministic policy is worse than the demonstrator. The column
-`strategy` reveals which.
+**Two strategies**, drawn for each episode: to reach another side of the block, it prefers to walk around it clockwise
+or anticlockwise (as the table is usually drawn, y downwards), unless that is half as long again as the other way. So
+one observation can have two answers. The column `strategy` tells which was the episode's.
 
 An episode ends when more than 95 % of the outline is covered, at most 300 steps after it began.
 
@@ -110,6 +120,6 @@ An episode ends when more than 95 % of the outline is covered, at most 300 steps
 | `next.done` | true at the last frame of an episode |
 | `strategy` | 0 anticlockwise, 1 clockwise; hidden from policies unless they are given it |
 
-The last frame of an episode shows the success; nothing was carried out there, and its action and `next.*` repeat
-those of the frame before.
+The last frame of an episode shows the success; nothing was carried out there, and its action and `next.*` repeat those
+of the frame before.
 """

@@ -47,6 +47,8 @@ HAND_WALK_PX, HAND_PUSH_PX = 8.0, 1.0
 Demonstrations that never stray teach nothing about getting back."""
 HAND_MEMORY = 0.8
 """How much of it is left after a frame."""
+ACTION_STEP_PX = 0.25
+"""Actions are whole multiples of this, as a pointing device reports them; it also keeps the file small."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,8 @@ class _Hand:
         fresh = self._random.standard_normal(2)
         self._error = HAND_MEMORY * self._error + (1 - HAND_MEMORY**2) ** 0.5 * fresh
         aimed = np.asarray(target) + unsteadiness_px * self._error
-        return np.clip(aimed, MARGIN_PX, TABLE_PX - MARGIN_PX).astype(np.float32)
+        reported = np.round(aimed / ACTION_STEP_PX) * ACTION_STEP_PX
+        return np.clip(reported, MARGIN_PX, TABLE_PX - MARGIN_PX).astype(np.float32)
 
 
 def record_pusht(

@@ -13,8 +13,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pipeline.simulate.pusht import TABLE_PX, advance, make_environment
 from pipeline.simulate.pusht_geometry import (
     CONTACTS,
@@ -33,8 +31,8 @@ from pipeline.simulate.pusht_geometry import (
 if TYPE_CHECKING:
     from gym_pusht.envs.pusht import PushTEnv
 
-WALK_SPEED_PX = 16.0
-PUSH_SPEED_PX = 10.0
+WALK_SPEED_PX = 18.0
+PUSH_SPEED_PX = 12.0
 """Px that the target moves in a frame. The finger lags about two frames behind."""
 PAUSE_FRAMES = 2
 """The target rests this long before a push and after it, so that the finger arrives."""
@@ -169,7 +167,6 @@ class Planner:
         targets = targets_along(path, WALK_SPEED_PX) + [standoff] * PAUSE_FRAMES
         walk_frames = len(targets)
         targets += targets_along([standoff, end], PUSH_SPEED_PX) + [end] * PAUSE_FRAMES
-        targets = [_recordable(target) for target in targets]
         self._place(state)
         for target in targets:
             advance(self._trial, *target)
@@ -215,8 +212,3 @@ def _clamped(point: Point) -> Point:
     """A point of a path around a block that lies close to the edge of the table."""
     low, high = MARGIN_PX, TABLE_PX - MARGIN_PX
     return (min(max(point[0], low), high), min(max(point[1], low), high))
-
-
-def _recordable(point: Point) -> Point:
-    """What is left of a point when it is written down as float32: that is what must be carried out."""
-    return (float(np.float32(point[0])), float(np.float32(point[1])))

@@ -3,7 +3,7 @@
 What belongs here: the loop between policy and simulator, for any simulator. What does not: physics, success intervals.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -54,23 +54,17 @@ def rollout(
         padded = block + [block[-1]] * (batch - len(block))
         episode = _Episode(simulator, observation_set, padded, history, name)
         episode.running[len(block) :] = False
-        while episode.running.any() and episode.frame < limit:
-            chunk = episode.ask(policy)
-            for k in range(min(execute, chunk.shape[1], limit - episode.frame)):
-                if episode.running.any():
-                    episode.act(chunk[:, k])
+        for frame in episode.run(policy, execute, limit):
             if on_frame:
-                on_frame(len(parts) * limit + episode.frame, total)
+                on_frame(len(parts) * limit + frame, total)
         parts.append({key: value[: len(block)] for key, value in episode.results().items()})
-    length = max(part["paths"].shape[1] for part in parts)
-    results = {key: np.concatenate([_lengthen(part[key], length, key) for part in parts]) for key in parts[0]}
     return Rollouts(
         simulator=simulator.name,
         simulator_version=simulator.version(),
         policy=name,
         observations=observation_set.name,
         start_states=np.asarray(numbers, dtype=np.int64),
-        **(results | ({} if results["paths"].shape[2] else {"paths": None})),
+        **_joined(parts),
     )
 
 
@@ -91,6 +85,15 @@ class _Episode:
         self._best_reward, self._best_coverage = np.zeros(rows), np.zeros(rows)
         self._steps = np.zeros(rows, dtype=np.int64)
         self._path = [self._where(self.running)]
+
+    def run(self, policy, execute: int, limit: int) -> Iterator[int]:
+        """To the end of all environments; gives the frame after every answer that was carried out."""
+        while self.running.any() and self.frame < limit:
+            chunk = self.ask(policy)
+            for k in range(min(execute, chunk.shape[1], limit - self.frame)):
+                if self.running.any():
+                    self.act(chunk[:, k])
+            yield self.frame
 
     def ask(self, policy) -> np.ndarray:
         """[R, K, A] the policy's chunk for every environment, finished ones included."""
@@ -143,9 +146,11 @@ class _Episode:
         return np.where(moved[:, None], place, np.nan).astype(np.float32)
 
 
-def _lengthen(values: np.ndarray, length: int, key: str) -> np.ndarray:
-    """Paths of one batch padded with NaN to the longest batch; anything else as it is."""
-    if key != "paths":
-        return values
-    missing = length - values.shape[1]
-    return np.pad(values, ((0, 0), (0, missing), (0, 0)), constant_values=np.nan)
+def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray | None]:
+    """The batches one after another; paths are padded with NaN to the longest, and None where there is nothing in them."""
+    length = max(part["paths"].shape[1] for part in parts)
+    for part in parts:
+        missing = length - part["paths"].shape[1]
+        part["paths"] = np.pad(part["paths"], ((0, 0), (0, missing), (0, 0)), constant_values=np.nan)
+    joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    return joined if joined["paths"].shape[2] else joined | {"paths": None}

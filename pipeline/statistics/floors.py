@@ -62,18 +62,20 @@ def radius_floor(
     counted = [(probe, group) for probe, group in zip(asked, groups, strict=True) if len(group) >= min_neighbours]
     if not counted:
         return _refuse(described, f"none of {len(asked)} probes has {min_neighbours} frames within {radius:g}")
-    actions = demos.columns[ACTION]
+    return RadiusFloor(**described, **_measure(counted, demos.columns[ACTION], horizon), refused=None)
+
+
+def _measure(counted: list[tuple[int, np.ndarray]], actions: np.ndarray, horizon: int) -> dict[str, Any]:
+    """What the groups of the probes that count amount to."""
     spreads = [_distance_to_mean(actions[group + horizon]) for _, group in counted]
     probe, group = max(counted, key=lambda pair: len(pair[1]))
-    return RadiusFloor(
-        **described,
-        probes=len(counted),
-        median_neighbours=float(np.median([len(group) for _, group in counted])),
-        mean=float(np.mean(spreads)),
-        p90=float(np.percentile(spreads, 90)),
-        crowded=Neighbourhood(int(probe), group, actions[group + horizon]),
-        refused=None,
-    )
+    return {
+        "probes": len(counted),
+        "median_neighbours": float(np.median([len(group) for _, group in counted])),
+        "mean": float(np.mean(spreads)),
+        "p90": float(np.percentile(spreads, 90)),
+        "crowded": Neighbourhood(int(probe), group, actions[group + horizon]),
+    }
 
 
 def _refuse(described: dict[str, Any], why: str) -> RadiusFloor:
