@@ -14,6 +14,7 @@ from typing import Any
 
 from pipeline.config import hash_of
 from pipeline.experiment import Experiment, Variant
+from pipeline.methods import METHODS
 from pipeline.store import Store
 
 CODE_VERSIONS = {
@@ -38,7 +39,7 @@ POLICY = ("trained_policy", "predictions", "rollouts")
 FLOOR = {"radius": None, "probes": 2000, "min_neighbours": 5}
 """The notebook's floor settings, used by the benchmark; `demobench floor` takes others. None is the estimator's default."""
 
-SIMULATOR_PACKAGES = {"pusht": ("gym-pusht", "pymunk")}
+SIMULATOR_PACKAGES = {"pusht": ("gym-pusht", "pymunk", "shapely")}
 
 
 @dataclass(frozen=True)
@@ -214,8 +215,6 @@ class Plan:
 
 
 def _depends_on_set(variant: Variant) -> bool:
-    from pipeline.policies import METHODS
-
     return METHODS[variant.method].uses_observations
 
 

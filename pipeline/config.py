@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipeline.errors import ConfigError, did_you_mean
+from pipeline.methods import METHODS
 from pipeline.types import ActionKind, Protocol
 
 BUDGETS = {"quick": 600, "standard": 3_000, "thorough": 20_000}
@@ -166,8 +167,6 @@ def parse_config(raw: dict[str, Any], where: str) -> Config:
         raise ConfigError(f"{where}: {error}") from None
     except ValidationError as error:
         raise ConfigError(f"{where}: {_first_problem(error)}") from None
-    from pipeline.policies import METHODS
-
     for name, policy in config.policies.items():
         if policy.method not in METHODS:
             raise ConfigError(

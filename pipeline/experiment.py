@@ -22,7 +22,7 @@ from pipeline.config import (
     hash_of,
 )
 from pipeline.errors import ConfigError, did_you_mean
-from pipeline.policies import METHODS
+from pipeline.methods import METHODS
 from pipeline.types import ObservationSet, Protocol
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.experiment import Experiment, Variant
 from pipeline.lerobot_format.quality import dead_columns
-from pipeline.policies import METHODS
+from pipeline.methods import METHODS
 from pipeline.types import ACTION, Demonstrations, Fold, ObservationSet, Predictions, Semantics, Split
 from pipeline.windows import Windows, make_windows
 

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import PolicyError, did_you_mean
-from pipeline.policies import METHODS, Plan
+from pipeline.methods import METHODS
+from pipeline.policies import Plan
 from pipeline.windows import Windows
 
 WEIGHTS, POLICY, TRAINING = "weights.safetensors", "policy.json", "training.json"

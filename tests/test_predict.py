@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from pipeline import predict
 from pipeline.errors import StoreError
-from pipeline.policies import METHODS, Plan
+from pipeline.methods import METHODS
+from pipeline.policies import Plan
 from pipeline.predict import (
     join_folds,
     latency_ms,

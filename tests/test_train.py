@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import PolicyError
-from pipeline.policies import METHODS
+from pipeline.methods import METHODS
 from pipeline.predict import predict_policy
 from pipeline.statistics.metrics import episode_errors, summarise
 from pipeline.train import load_trained, save_trained, train_policy, weights_hash

@@ -14,7 +14,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def run(*words, cwd: Path, **environment: str) -> subprocess.CompletedProcess:
-    inherited = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV", "DEMOBENCH", "DAGSTER"))}
+    inherited = {
+        k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV", "DEMOBENCH", "DAGSTER"))
+    }
     out = subprocess.run(
         [*map(str, words)], cwd=cwd, env={**inherited, **environment}, capture_output=True, text=True, check=False
     )
@@ -41,6 +43,8 @@ def test_it_inspects_and_benchmarks_in_an_empty_folder(installed, tmp_path):
     out = run(installed / "demobench", *words, cwd=tmp_path, NO_COLOR="1")
     (found,) = json.loads(out.stdout)
     assert {"hold_still", "mlp_k01"} <= {row["policy"] for row in found["policies"]}
-    assert all(row["rollouts"] is None for row in found["policies"]), "the simulator is an extra, and it is not installed"
+    assert all(row["rollouts"] is None for row in found["policies"]), (
+        "the simulator is an extra, and it is not installed"
+    )
     assert Path(found["artifacts"]["report"]).stat().st_size > 100_000
     assert Path(found["artifacts"]["report"]).is_relative_to(tmp_path)

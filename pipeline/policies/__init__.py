@@ -1,4 +1,4 @@
-"""Policies: one method a file, and one explicit dictionary that names them.
+"""Policies: one method a file; `pipeline.methods` names them.
 
 A method is a class whose objects are fitted policies:
 
@@ -9,16 +9,13 @@ A method is a class whose objects are fitted policies:
     restore(arrays, settings) → policy              the inverse
     seeds, chunk, parameters                        `chunk` is None where there is none; `parameters` are one network's
 
-A policy owns its transform, and its arrays hold it. `METHODS` holds what the rest of the project may ask about a method
-without importing torch; files are written and read by `pipeline.train`.
+A policy owns its transform, and its arrays hold it. Files are written and read by `pipeline.train`.
 """
 
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -56,37 +53,3 @@ class Curve:
     steps: np.ndarray
     losses: np.ndarray
     train_s: float
-
-
-@dataclass(frozen=True)
-class Method:
-    """Where a method lives and what a benchmark must know before building it.
-
-    chunk              "set": the config names chunk sizes, one policy each; "one": always a single action; "none": it
-                       can be asked for any horizon and is scored on all
-    trained            it has seeds and training steps (and is rolled out where there is a simulator)
-    uses_observations  its answer depends on the observation set; else it runs once a data set
-    recipe             which windows it is made for (`windows.Recipe`)
-    """
-
-    module: str
-    cls: str
-    chunk: Literal["set", "one", "none"] = "none"
-    trained: bool = False
-    uses_observations: bool = True
-    recipe: Literal["arm", "every_frame"] = "arm"
-
-    def load_class(self) -> type:
-        return getattr(import_module(self.module), self.cls)
-
-
-METHODS: dict[str, Method] = {
-    "hold_still": Method("pipeline.policies.hold_still", "HoldStill", uses_observations=False),
-    "mean_action": Method("pipeline.policies.mean_action", "MeanAction", uses_observations=False),
-    "constant_velocity": Method("pipeline.policies.constant_velocity", "ConstantVelocity", uses_observations=False),
-    "nearest_neighbour": Method("pipeline.policies.nearest_neighbour", "NearestNeighbour"),
-    "mlp": Method("pipeline.policies.mlp", "Mlp", chunk="set", trained=True),
-    "notebook_pusht": Method(
-        "pipeline.policies.notebook_pusht", "NotebookPushT", chunk="one", trained=True, recipe="every_frame"
-    ),
-}

@@ -11,7 +11,7 @@ from typing import Any
 import altair as alt
 import numpy as np
 
-from pipeline.policies import METHODS
+from pipeline.methods import METHODS
 from pipeline.sinks import charts, planes
 from pipeline.sinks.words import common_unit, show
 from pipeline.types import ACTION, STATE, Demonstrations, Predictions, RadiusFloor, Rollouts, Semantics

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.policies import METHODS
+from pipeline.methods import METHODS
 from pipeline.sinks import explanations, replacing
 from pipeline.sinks.markup import Html, element, join, json_for_script, script_text
 from pipeline.sinks.page_style import draw_script, style_sheet, themed
@@ -154,6 +154,10 @@ def _best_offline(rows: Sequence[Mapping[str, Any]], unit: str) -> Html:
 def _best_driven(rows: Sequence[Mapping[str, Any]]) -> Html:
     most = max(rows, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]))
     n, rate, interval = most["rollouts"]["n"], most["rollouts"]["success"], most["rollouts"].get("success_interval")
+    if rate == 0:
+        score = element("b", show(most["rollouts"]["score"]))
+        none = f"In closed loop no policy succeeds from any of {n} start states; the highest score is that of "
+        return join(none, _who(most), ": ", score, ".")
     count = element("b", f"{round(rate * n)} of {n}")
     percent = f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f} %)" if show_interval(interval) else ""
     return join("In closed loop ", _who(most), " succeeds most often: ", count, percent, ".")

@@ -94,7 +94,7 @@ def _head(title: str, below: str, class_: str | None = None) -> Html:
 
 def _best(column: Column, rows: Sequence[Row]) -> Any:
     values = [value for row in rows if is_number(value := column.value(row))]
-    if column.better is None or len(values) < 2:
+    if column.better is None or len(set(values)) < 2:
         return None
     return min(values) if column.better == "low" else max(values)
 

@@ -213,12 +213,12 @@ def _log_model(client: Any, run_id: str, weights: Path, task: PolicyTask) -> Non
     """The policy as an MLflow pyfunc: code from this package, weights as a safetensors artefact."""
     import mlflow
 
-    from pipeline.policies import load
+    from pipeline.sinks import mlflow_model
 
     with mlflow.start_run(run_id=run_id, log_system_metrics=False):
         mlflow.pyfunc.log_model(
             name="model",
-            python_model=load.__file__,
+            python_model=mlflow_model.__file__,
             artifacts={"policy": str(weights)},
             pip_requirements=["demobench"],
             metadata={"policy": task.variant.name, "observations": task.observation_set.name},

@@ -16,8 +16,9 @@ import numpy as np
 from pipeline.folds import PolicyTask
 from pipeline.lerobot_format.kinds import wrap
 from pipeline.lerobot_format.quality import dead_columns
+from pipeline.methods import METHODS
 from pipeline.normalize import circular_columns, frames_of
-from pipeline.policies import METHODS, Plan
+from pipeline.policies import Plan
 from pipeline.predict import join_folds, predict_policy, temporal_ensemble
 from pipeline.statistics.intervals import Interval, mean_interval
 from pipeline.types import ACTION, Demonstrations, EpisodeErrors, Predictions, Protocol, Semantics, Split

@@ -104,7 +104,9 @@ def test_the_ui_runs_the_command_lines_run_again(served):
     answer = graphql(dagster, REEXECUTE, parent=first["runId"])["launchRunReexecution"]
     assert answer["__typename"] == "LaunchRunSuccess", answer
     again = answer["run"]["runId"]
-    done = wait_for(lambda: [r for r in runs(dagster) if r["runId"] == again and r["status"] in ("SUCCESS", "FAILURE")], 240)
+    done = wait_for(
+        lambda: [r for r in runs(dagster) if r["runId"] == again and r["status"] in ("SUCCESS", "FAILURE")], 240
+    )
     assert done[0]["status"] == "SUCCESS"
     after = {p: p.read_text() for p in (place / "results" / "datasets").rglob("made.json")}
     assert after == before, "nothing was stale, so the second run made nothing again"

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.policies import METHODS, Plan
+from pipeline.methods import METHODS
+from pipeline.policies import Plan
 from pipeline.types import ACTION, STATE, Observations
 from pipeline.windows import make_windows
 from tests.hand_made import STATE_ONLY, demonstrations, random_walks, semantics

@@ -1,0 +1,42 @@
+"""The methods there are: one explicit dictionary from a name to where a method lives and what a benchmark must know of it.
+
+What belongs here: what may be asked about a method without importing torch. What does not: the methods (`policies`).
+"""
+
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class Method:
+    """Where a method lives and what a benchmark must know before building it.
+
+    chunk              "set": the config names chunk sizes, one policy each; "one": always a single action; "none": it
+                       can be asked for any horizon and is scored on all
+    trained            it has seeds and training steps (and is rolled out where there is a simulator)
+    uses_observations  its answer depends on the observation set; else it runs once a data set
+    recipe             which windows it is made for (`windows.Recipe`)
+    """
+
+    module: str
+    cls: str
+    chunk: Literal["set", "one", "none"] = "none"
+    trained: bool = False
+    uses_observations: bool = True
+    recipe: Literal["arm", "every_frame"] = "arm"
+
+    def load_class(self) -> type:
+        return getattr(import_module(self.module), self.cls)
+
+
+METHODS: dict[str, Method] = {
+    "hold_still": Method("pipeline.policies.hold_still", "HoldStill", uses_observations=False),
+    "mean_action": Method("pipeline.policies.mean_action", "MeanAction", uses_observations=False),
+    "constant_velocity": Method("pipeline.policies.constant_velocity", "ConstantVelocity", uses_observations=False),
+    "nearest_neighbour": Method("pipeline.policies.nearest_neighbour", "NearestNeighbour"),
+    "mlp": Method("pipeline.policies.mlp", "Mlp", chunk="set", trained=True),
+    "notebook_pusht": Method(
+        "pipeline.policies.notebook_pusht", "NotebookPushT", chunk="one", trained=True, recipe="every_frame"
+    ),
+}
