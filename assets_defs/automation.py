@@ -7,7 +7,7 @@ import dagster as dg
 
 from assets_defs.data import PARTITIONS
 from assets_defs.plan import Plan
-from assets_defs.resources import Workbench
+from assets_defs.resources import Workbench, asset_keys
 from pipeline.config import Config
 from pipeline.experiment import Variant
 
@@ -40,7 +40,7 @@ def stale_assets(workbench: Workbench, key: str) -> list[dg.AssetKey]:
     """The assets of a partition that have work to do, as keys; policies that must be named are left out."""
     by_itself = tuple(v.name for v in workbench.variants if not v.only_when_named)
     plan = Plan(workbench.store, key, workbench.experiment(key), workbench.variants, by_itself)
-    return list(dict.fromkeys(dg.AssetKey(unit.asset.split("/")) for unit in plan.stale()))
+    return asset_keys(plan.stale())
 
 
 def _weekly(config: Config, job: Any) -> dg.ScheduleDefinition:

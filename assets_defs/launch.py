@@ -5,11 +5,13 @@ What belongs here: the instance in the results folder, creating and executing a 
 """
 
 import os
+import signal
 import socket
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import dagster as dg
 import psutil
@@ -77,6 +79,41 @@ def close_dead_runs(instance: dg.DagsterInstance) -> list[str]:
     for run in dead:
         instance.report_run_failed(run, message=f"The process {run.tags[PID_TAG]} that made this run is gone.")
     return [run.run_id for run in dead]
+
+
+class Interrupts:
+    """Ctrl-C that cannot be lost.
+
+    Python drops an exception that a signal raises inside a garbage-collection callback, which a long training runs into
+    sooner or later. The signal's number is kept in a pipe, and `check`, called between two pieces of work, raises again.
+    """
+
+    def __enter__(self) -> "Interrupts":
+        self._read, self._write = os.pipe()
+        os.set_blocking(self._read, False)
+        os.set_blocking(self._write, False)
+        self._before = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+        self._hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        sys.unraisablehook = self._hook
+        signal.set_wakeup_fd(self._before)
+        os.close(self._read)
+        os.close(self._write)
+
+    def _unraisable(self, dropped: Any) -> None:
+        if dropped.exc_type not in (DagsterExecutionInterruptedError, KeyboardInterrupt):
+            self._hook(dropped)
+
+    def check(self) -> None:
+        """Raise DagsterExecutionInterruptedError where Ctrl-C came since the last check."""
+        try:
+            received = os.read(self._read, 4096)
+        except BlockingIOError:
+            return
+        if signal.SIGINT in received:
+            raise DagsterExecutionInterruptedError
 
 
 def run_benchmark(

@@ -5,7 +5,7 @@ asset's results are made, published, checked and described. What does not: what 
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -217,6 +217,11 @@ def _check(asset_key: dg.AssetKey, name: str, made: Mapping[str, Made]) -> dg.As
         passed=all(passed for passed, _ in verdicts.values()),
         metadata={"why": words or "nothing to check"},
     )
+
+
+def asset_keys(units: Iterable[Unit]) -> list[dg.AssetKey]:
+    """The assets that some results belong to, each once, in order."""
+    return list(dict.fromkeys(dg.AssetKey(unit.asset.split("/")) for unit in units))
 
 
 def check_spec(asset: dg.AssetKey, name: str, description: str) -> dg.AssetCheckSpec:

@@ -120,19 +120,22 @@ def _materialise(target: Target, session: Session, stale: Sequence[Any]) -> None
 
     with RunProgress(session.console, target, stale) as progress:
         from assets_defs.definitions import build_defs
-        from assets_defs.launch import close_dead_runs, open_instance, run_benchmark
+        from assets_defs.launch import Interrupts, close_dead_runs, open_instance, run_benchmark
+        from assets_defs.resources import asset_keys
 
-        defs = build_defs(
-            session.config,
-            config_dir=session.config_dir,
-            store=session.store,
-            progress=progress.report,
-            experiments={target.key: target.experiment},
-        )
-        import dagster as dg
+        with Interrupts() as interrupts, open_instance(session.store.root) as instance:
 
-        assets = list(dict.fromkeys(dg.AssetKey(unit.asset.split("/")) for unit in stale))
-        with open_instance(session.store.root) as instance:
+            def report(*what: Any) -> None:
+                interrupts.check()
+                progress.report(*what)
+
+            defs = build_defs(
+                session.config,
+                config_dir=session.config_dir,
+                store=session.store,
+                progress=report,
+                experiments={target.key: target.experiment},
+            )
             for run_id in close_dead_runs(instance):
                 progress.say(f"closed run {run_id[:8]}, whose process was gone")
             try:
@@ -140,7 +143,7 @@ def _materialise(target: Target, session: Session, stale: Sequence[Any]) -> None
                     instance,
                     defs,
                     target.key,
-                    assets,
+                    asset_keys(stale),
                     target.observations,
                     [v.name for v in target.selected],
                     progress.on_event,

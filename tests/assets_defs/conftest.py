@@ -9,6 +9,7 @@ import pytest
 from assets_defs.definitions import build_defs
 from assets_defs.launch import open_instance, run_benchmark
 from assets_defs.plan import Plan
+from assets_defs.resources import asset_keys
 from pipeline.config import Config, parse_config
 from pipeline.experiment import Choices, Target, resolve_target
 from pipeline.store import Store
@@ -51,7 +52,7 @@ class TinyBenchmark:
         """Make what is stale; returns the assets that were stale and the run."""
         target, stale = self.target(**choices), self.plan(**choices).stale()
         self.store.register(target.key, target.experiment.model_dump(mode="json"))
-        assets = list(dict.fromkeys(dg.AssetKey(unit.asset.split("/")) for unit in stale))
+        assets = asset_keys(stale)
         with open_instance(self.store.root) as instance:
             selected = [v.name for v in target.selected]
             run = run_benchmark(instance, self.defs(**choices), target.key, assets, target.observations, selected)
