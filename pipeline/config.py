@@ -105,6 +105,7 @@ PUSHT_SIM = DatasetConfig(
     simulator="pusht",
     budget="quick",
     kind="position",
+    circular=("block_angle_rad",),
     observations={
         "position": ("observation.state",),
         "pose": ("observation.state", "observation.environment_state"),

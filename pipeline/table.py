@@ -65,7 +65,7 @@ def dataset_json(facts: Mapping[str, Any]) -> dict[str, Any]:
     """The `dataset` object of every command's JSON."""
     keys = (
         "name", "revision", "content_hash", "episodes", "frames", "fps", "action_names", "action_units", "action_kinds",
-        "tracking_lag",
+        "tracking_lag", "warnings",
     )  # fmt: skip
     return json_safe({key: facts[key] for key in keys})
 
@@ -145,6 +145,8 @@ def render_table(table: Mapping[str, Any], console: "Console") -> None:
     narrow = [f"left out for want of width: {', '.join(left_out)} (all in --json)"] if left_out else []
     for line in (*_footnotes(table), *narrow):
         console.print(line, style="dim", soft_wrap=True)
+    for warning in dataset["warnings"]:
+        console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
     console.print()
 
 

@@ -26,7 +26,7 @@ def facts_of(demos, meaning):
     return {
         "name": "[bold]tape[/]", "revision": None, "content_hash": demos.content_hash, "episodes": demos.episodes,
         "frames": demos.frames, "fps": demos.fps, "action_names": action.names, "action_units": action.units,
-        "action_kinds": meaning.kinds, "tracking_lag": meaning.tracking_lag, "warnings": ["not part of the table"],
+        "action_kinds": meaning.kinds, "tracking_lag": meaning.tracking_lag, "warnings": ["a joint hardly moves"], "source": "not part of the table",
     }  # fmt: skip
 
 
@@ -51,7 +51,7 @@ def test_it_has_the_shape_that_is_promised(table):
     assert {"dataset", "protocol", "split", "floor", "brackets", "policies", "artifacts"} <= set(table)
     assert set(table["dataset"]) == {
         "name", "revision", "content_hash", "episodes", "frames", "fps", "action_names", "action_units", "action_kinds",
-        "tracking_lag",
+        "tracking_lag", "warnings",
     }  # fmt: skip
     assert table["brackets"] == []
     assert {"probes", "median_neighbours", "mean", "p90"} <= set(table["floor"]["radius"])
@@ -118,7 +118,7 @@ def test_parts_that_other_commands_show():
     assert shown["radius"]["mean"] is None
     assert shown["estimates"][0]["refused"].startswith("none of")
     assert floor_json([]) == {"radius": None, "estimates": []}
-    assert "warnings" not in dataset_json(facts_of(demos, semantics(demos)))
+    assert "source" not in dataset_json(facts_of(demos, semantics(demos)))
 
 
 def test_numpy_does_not_leak_into_json():

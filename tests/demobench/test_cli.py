@@ -160,7 +160,10 @@ def test_ctrl_c_leaves_no_debris_and_the_next_run_goes_on(place):
     while not list((place / "stopped").glob("datasets/*/mlp_k01/**/.state.*.draft")) and time.monotonic() < deadline:
         time.sleep(0.2)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    try:
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert process.returncode == 130, err
     assert "Stopped. What was finished is kept" in out
     assert "Traceback" not in err
