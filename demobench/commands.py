@@ -1,6 +1,7 @@
 """What the commands do: settings → plan → Dagster run → table. `cli.py` holds their arguments, `progress.py` the bars."""
 
 import json
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -116,6 +117,8 @@ def _run_one(target: Target, session: Session) -> dict[str, Any]:
 
 
 def _materialise(target: Target, session: Session, stale: Sequence[Any]) -> None:
+    from sqlalchemy.exc import SQLAlchemyError
+
     from demobench.progress import RunProgress
 
     with RunProgress(session.console, target, stale) as progress:
@@ -152,6 +155,11 @@ def _materialise(target: Target, session: Session, stale: Sequence[Any]) -> None
                 progress.stop()
                 session.console.print("Stopped. What was finished is kept; the same command goes on from there.")
                 raise typer.Exit(130) from None
+            except (OSError, SQLAlchemyError) as error:
+                raise StoreError(
+                    f"The run stopped because its log could not be written: {str(error).splitlines()[0]}. Results that were "
+                    f"finished are intact in {session.store.root}. Free some space there and run the same command again."
+                ) from error
     if not run.is_success:
         progress.raise_failure(run.run_id)
 
@@ -180,9 +188,9 @@ def _show(report: Mapping[str, Any], target: Target, session: Session) -> None:
     paths = report["artifacts"]
     opens = {
         "report": f"xdg-open {_short(paths['report'])}",
-        "mcap": f"rerun --bind 127.0.0.1 {_short(paths['mcap'])}",
-        "rerun": f"rerun --bind 127.0.0.1 {_short(paths['rerun'])}",
-        "mlflow": "demobench ui",
+        "mcap": f"{_program('rerun')} --bind 127.0.0.1 {_short(paths['mcap'])}",
+        "rerun": f"{_program('rerun')} --bind 127.0.0.1 {_short(paths['rerun'])}",
+        "mlflow": f"{_program('demobench')} ui",
     }
     names = {"report": "Report", "mcap": "MCAP", "rerun": "Rerun", "mlflow": "MLflow"}
     for kind, name in names.items():
@@ -193,6 +201,13 @@ def _show(report: Mapping[str, Any], target: Target, session: Session) -> None:
             "  [yellow]This run has policies or chunk sizes that the configuration does not define: the Dagster UI shows it "
             "but cannot run it again.[/]"
         )
+
+
+def _program(name: str) -> str:
+    """How to call a program that was installed beside this one: by name where that finds it, else by its path."""
+    here = Path(sys.executable).parent / name
+    found = shutil.which(name)
+    return name if found and Path(found).resolve() == here.resolve() else _short(str(here))
 
 
 def _short(path: str) -> str:

@@ -26,6 +26,8 @@ from pipeline.errors import StoreError
 
 MADE = "made.json"
 EXPERIMENT = "experiment.json"
+LEAST_FREE_MB = 100
+"""Below this much free space no run is started: the databases of Dagster and MLflow alone take tens of MB."""
 
 
 @dataclass(frozen=True)
@@ -55,11 +57,17 @@ class Store:
             probe = self.root / f".probe-{os.getpid()}"
             probe.write_bytes(b"x")
             probe.unlink()
+            free_mb = shutil.disk_usage(self.root).free / 1e6
         except OSError as error:
             raise StoreError(
                 f"Results cannot be written to {self.root}: {error.strerror or error}. "
                 "Free some space or choose another folder with --store."
             ) from None
+        if free_mb < LEAST_FREE_MB:
+            raise StoreError(
+                f"There is no room for results at {self.root}: {free_mb:.0f} MB are free, and a benchmark needs at least "
+                f"{LEAST_FREE_MB}. Free some space or choose another folder with --store."
+            )
         return self
 
     def dataset(self, key: str) -> Path:

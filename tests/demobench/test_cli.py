@@ -1,5 +1,6 @@
 """The command line as a user meets it: real processes, their output and exit status."""
 
+import contextlib
 import json
 import os
 import signal
@@ -177,3 +178,54 @@ def test_help_has_examples(place):
         out = demobench(*command, "--help", cwd=place)
         assert "Example" in out.stdout, command
         assert f"demobench {' '.join(command)}" in out.stdout.split("Example")[1], command
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of a chosen size, in memory."""
+    mounted = []
+
+    def mount(size: str) -> Path:
+        folder = tmp_path / f"disk-{size}"
+        folder.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+        if subprocess.run(command, capture_output=True, check=False).returncode:
+            pytest.skip("a small file system cannot be mounted here (it takes root)")
+        mounted.append(folder)
+        return folder
+
+    yield mount
+    for folder in mounted:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_no_room_is_said_before_any_work(place, small_disk):
+    out = demobench("run", "tape", *QUICK, "--store", small_disk("2m") / "results", cwd=place)
+    assert out.returncode == 2
+    assert "There is no room for results" in out.stderr
+
+
+@pytest.mark.slow
+def test_a_disk_that_fills_up_in_the_middle_is_one_message(place, small_disk):
+    store = small_disk("104m") / "results"
+    filler = store.parent / "filler"
+    command = [sys.executable, "-m", "demobench.cli", "run", "tape", "--chunks", "4", "--store", str(store)]
+    process = subprocess.Popen(command, cwd=place, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline = time.monotonic() + 120
+        while not list(store.glob("datasets/*/windows/made.json")) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        with filler.open("wb") as file, contextlib.suppress(OSError):
+            while file.write(b"x" * 2**20):
+                file.flush()
+        _, err = process.communicate(timeout=200)
+    finally:
+        process.kill()
+    assert process.returncode == 2
+    assert "Traceback" not in err
+    assert err.count("error:") == 1
+    assert "space" in err
+    finished = [p.parent for p in store.rglob("made.json")]
+    assert any(p.name == "demonstrations" for p in finished)
+    for folder in finished:
+        json.loads((folder / "made.json").read_text())

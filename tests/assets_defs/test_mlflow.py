@@ -1,0 +1,106 @@
+"""What a benchmark leaves in MLflow, read back through MLflow itself."""
+
+import json
+import subprocess
+import sys
+
+import mlflow
+import numpy as np
+import pytest
+
+from assets_defs.plan import Unit
+from pipeline.lerobot_format.saved import load_demonstrations
+from pipeline.predict import load_predictions
+from pipeline.sinks.to_mlflow import find_run, tracking_uri
+
+FRESH = """
+import json, sys
+import mlflow
+mlflow.set_tracking_uri(sys.argv[1])
+model = mlflow.pyfunc.load_model(sys.argv[2])
+print(json.dumps(model.predict(json.loads(sys.argv[3]))))
+"""
+
+
+@pytest.fixture(scope="module")
+def client(finished):
+    return mlflow.MlflowClient(tracking_uri("sqlite", finished.store.root))
+
+
+@pytest.fixture(scope="module")
+def run_of(finished, client):
+    """The MLflow run of a policy, as the store remembers it."""
+
+    def find(policy: str):
+        made = finished.store.made(finished.plan().folder(Unit(f"{policy}/trained_policy", "state")))
+        return client.get_run(made.summary["mlflow_run_id"])
+
+    return find
+
+
+def test_one_experiment_one_run_a_policy_seeds_nested(client, run_of):
+    experiment = client.get_experiment_by_name("tiny")
+    runs = client.search_runs([experiment.experiment_id], max_results=1000)
+    top = {r.info.run_name for r in runs if "mlflow.parentRunId" not in r.data.tags}
+    assert top == {
+        "hold_still/state", "mean_action/state", "constant_velocity/state", "nearest_neighbour/state", "mlp_k01/state",
+        "mlp_k04/state",
+    }  # fmt: skip
+    parent = run_of("mlp_k04")
+    children = [r for r in runs if r.data.tags.get("mlflow.parentRunId") == parent.info.run_id]
+    assert {r.data.tags["demobench.seed"] for r in children} == {"0", "1"}
+    assert all(r.data.metrics["first_step_mae"] > 0 for r in children)
+    assert parent.data.params["chunk"] == "4"
+    assert parent.info.status == "FINISHED"
+
+
+def test_losses_and_errors_have_steps(finished, client, run_of):
+    parent = run_of("mlp_k04")
+    by_horizon = client.get_metric_history(parent.info.run_id, "error_by_horizon")
+    assert [m.step for m in sorted(by_horizon, key=lambda m: m.step)] == [0, 1, 2, 3]
+    table = json.loads((finished.plan().folder(Unit("benchmark_table")) / "table.json").read_text())
+    row = next(r for r in table["policies"] if r["policy"] == "mlp_k04")
+    assert [m.value for m in sorted(by_horizon, key=lambda m: m.step)] == pytest.approx(row["error_by_horizon"])
+    child = client.search_runs([parent.info.experiment_id], f"tags.`mlflow.parentRunId` = '{parent.info.run_id}'")[0]
+    assert len(client.get_metric_history(child.info.run_id, "loss_fold_0")) > 1
+    assert "error_by_horizon.png" in {a.path for a in client.list_artifacts(parent.info.run_id)}
+
+
+def test_the_model_predicts_in_a_fresh_process_what_was_scored(finished, run_of):
+    demos = load_demonstrations(finished.plan().folder(Unit("demonstrations")) / "frames")
+    predicted = load_predictions(finished.plan().folder(Unit("mlp_k04/predictions", "state")))
+    anchor = int(predicted.anchors[predicted.fold == 0][0])
+    seen = demos.columns["observation.state"][anchor - 2 : anchor + 1]
+    asked = json.dumps([{"values": seen.tolist()}])
+    uri, model = tracking_uri("sqlite", finished.store.root), f"runs:/{run_of('mlp_k04').info.run_id}/model"
+    out = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", FRESH, uri, model, asked], capture_output=True, text=True, check=False
+    )
+    assert out.returncode == 0, out.stderr[-2000:]
+    answer = np.array(json.loads(out.stdout.splitlines()[-1]))
+    assert answer.shape == (1, 4, 2)
+    scored = predicted.actions[0, np.flatnonzero(predicted.anchors == anchor)[0]]
+    np.testing.assert_allclose(answer[0], scored, rtol=1e-4, atol=1e-5)
+
+
+def test_a_model_holds_no_pickle(finished):
+    files = [p for p in (finished.store.root / "mlartifacts").rglob("*") if p.is_file()]
+    assert any(p.suffix == ".safetensors" for p in files)
+    assert not [p for p in files if p.suffix in (".pkl", ".pickle", ".pt", ".pth")]
+
+
+def test_a_run_that_is_gone_is_opened_again(finished, tmp_path):
+    from pipeline.folds import PolicyTask
+    from pipeline.lerobot_format.quality import resolve_semantics
+    from pipeline.split import load_split
+
+    plan = finished.plan()
+    demos = load_demonstrations(plan.folder(Unit("demonstrations")) / "frames")
+    variant = next(v for v in plan.variants if v.name == "mlp_k04")
+    split = load_split(plan.folder(Unit("episode_split")) / "split.json")
+    sets = plan.experiment.observation_sets
+    task = PolicyTask(demos, resolve_semantics(demos), split, sets[0], variant, plan.experiment)
+    uri = f"sqlite:///{tmp_path / 'mlflow.db'}"
+    opened = find_run(uri, "0" * 32, experiment="tiny", task=task, tags={"fingerprint": "f"})
+    again = find_run(uri, "0" * 32, experiment="tiny", task=task, tags={"fingerprint": "f"})
+    assert opened == again != "0" * 32
