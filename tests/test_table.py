@@ -26,7 +26,8 @@ def facts_of(demos, meaning):
     return {
         "name": "[bold]tape[/]", "revision": None, "content_hash": demos.content_hash, "episodes": demos.episodes,
         "frames": demos.frames, "fps": demos.fps, "action_names": action.names, "action_units": action.units,
-        "action_kinds": meaning.kinds, "tracking_lag": meaning.tracking_lag, "warnings": ["a joint hardly moves"], "source": "not part of the table",
+        "action_kinds": meaning.kinds, "tracking_lag": meaning.tracking_lag, "warnings": ["a joint hardly moves"],
+        "source": "not part of the table",
     }  # fmt: skip
 
 
