@@ -116,7 +116,7 @@ class Plan:
         """Every result of the selection that must be made again, and why, in the order of the work."""
         why: dict[Unit, str] = {}
         for unit in self.units():
-            behind = [i for i in self._inputs(unit) if i in why]
+            behind = [i for i in self.inputs(unit) if i in why]
             if behind:
                 why[unit] = f"{_words(behind[0])} is made again"
             elif self.store.made(self.folder(unit)) is None:
@@ -132,7 +132,7 @@ class Plan:
     def _fingerprint(self, unit: Unit) -> str | None:
         if unit.kind == "demonstrations":
             return self._demonstrations()
-        inputs = self._inputs(unit)
+        inputs = self.inputs(unit)
         if unit.asset in SUMMARIES:
             # A summary is made from whatever is up to date, so a policy that was never run does not hold it back.
             inputs = [i for i in inputs if i.kind not in POLICY or self.is_fresh(i)]
@@ -162,7 +162,8 @@ class Plan:
         settings = self.experiment.dataset.model_dump(mode="json", include={"source", "kind", "circular"})
         return {"settings": settings, "code": CODE_VERSIONS["demonstrations"]}
 
-    def _inputs(self, unit: Unit) -> list[Unit]:
+    def inputs(self, unit: Unit) -> list[Unit]:
+        """The results that one result is made from."""
         data = Unit("demonstrations")
         match unit.kind:
             case "demonstrations":

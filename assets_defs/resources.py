@@ -17,7 +17,7 @@ from pydantic import Field
 from assets_defs.plan import CODE_VERSIONS, Plan, Unit
 from pipeline.config import Config, hash_of
 from pipeline.errors import ConfigError, did_you_mean
-from pipeline.experiment import Experiment, Variant, from_config, variant_key
+from pipeline.experiment import Choices, Experiment, Variant, from_config, variant_key, with_choices
 from pipeline.store import Made, Meter, Store
 
 Say = Callable[[str], None]
@@ -91,8 +91,7 @@ class Workbench:
         """The partition of a run, with the budget of its launch. Only the first asset looks at the source."""
         key = context.partition_key
         base = self.experiment(key)
-        updates = {k: v for k, v in (("seeds", budget.seeds), ("steps", budget.steps)) if v is not None}
-        experiment = base.model_copy(update={**updates, **({"budget": None} if "steps" in updates else {})})
+        experiment = with_choices(base, Choices(seeds=budget.seeds, steps=budget.steps))
         if experiment != base:
             key = variant_key(key.split("+")[0], from_base(self, key, base), experiment)
             self.store.register(key, experiment.model_dump(mode="json"))
@@ -102,7 +101,7 @@ class Workbench:
                 known = did_you_mean(name, experiment.dataset.observations)
                 raise ConfigError(f"'{key}' has no observation set '{name}'. {known}")
         plan = Plan(self.store, key, experiment, self.variants, (), observations, look_at_source)
-        return Bench(self, plan, self.progress or Progress(context.log.info), context.run.run_id)
+        return Bench(self, plan, self.progress or Progress(context.log.info))
 
 
 def from_base(workbench: Workbench, key: str, fallback: Experiment) -> Experiment:
@@ -121,7 +120,6 @@ class Bench:
     workbench: Workbench
     plan: Plan
     progress: Callable[[str, int, int, str], None]
-    run_id: str
 
     @property
     def store(self) -> Store:
@@ -167,7 +165,7 @@ class Bench:
         if made is not None and expected is not None and made.fingerprint == expected:
             return made
         if expected is None and fingerprint is None:
-            missing = [i for i in self.plan._inputs(unit) if not self.plan.is_fresh(i)]
+            missing = [i for i in self.plan.inputs(unit) if not self.plan.is_fresh(i)]
             names = ", ".join(f"{i.asset} {i.entry}".strip() for i in missing)
             raise ConfigError(
                 f"{unit.asset} of '{self.plan.key}' needs {names}, which is missing or out of date. Materialise it first."

@@ -209,7 +209,7 @@ def resolve_target(
     ConfigError : no such data set, policy, chunk or observation set.
     """
     base_key, base = _base(argument, config, config_dir, registered)
-    changed = _with_choices(base, choices)
+    changed = with_choices(base, choices)
     selected = _select(changed, choices)
     for name in choices.observations:
         if name not in changed.dataset.observations:
@@ -247,7 +247,8 @@ def _free_key(source: str, config: Config, registered: Mapping[str, Any]) -> str
     return check_slug(name, f"data set {source}")
 
 
-def _with_choices(base: Experiment, choices: Choices) -> Experiment:
+def with_choices(base: Experiment, choices: Choices) -> Experiment:
+    """The settings that the choices lead to; equal to `base` where they change nothing."""
     updates: dict[str, Any] = {
         field: value
         for field in ("seeds", "folds", "protocol", "device")

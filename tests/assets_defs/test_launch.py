@@ -8,6 +8,8 @@ import dagster as dg
 import pytest
 
 from assets_defs.launch import HOST_TAG, PID_TAG, close_dead_runs, open_instance, run_benchmark
+from assets_defs.resources import Budget
+from pipeline.errors import ConfigError
 
 
 def test_a_run_can_be_found_and_run_again_by_the_ui(finished):
@@ -43,3 +45,16 @@ def test_runs_whose_process_is_gone_are_closed_and_others_left(finished):
         assert instance.get_run_by_id(runs["dead"].run_id).status == dg.DagsterRunStatus.FAILURE
         assert instance.get_run_by_id(runs["alive"].run_id).status == dg.DagsterRunStatus.STARTED
         instance.report_run_failed(runs["alive"])
+
+
+def test_another_budget_in_the_launchpad_is_the_command_lines_variant(finished):
+    workbench = finished.defs().resources["workbench"]
+    context = dg.build_asset_context(partition_key="tiny")
+    assert workbench.open(context, Budget()).plan.key == "tiny"
+    assert workbench.open(context, Budget(seeds=2, steps=6)).plan.key == "tiny", "the file's own numbers change nothing"
+    opened = workbench.open(context, Budget(seeds=1))
+    assert opened.plan.key == finished.target(seeds=1).key != "tiny"
+    assert opened.experiment.seeds == 1
+    assert finished.store.experiments()[opened.plan.key]["seeds"] == 1
+    with pytest.raises(ConfigError, match="no observation set 'stat'"):
+        workbench.open(context, Budget(observations=["stat"]))
