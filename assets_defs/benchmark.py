@@ -104,6 +104,13 @@ def _write_table(bench: Bench, draft) -> Outcome:
     )
 
 
+def _choice_of_policies(bench: Bench, table) -> str:
+    """What the command line must name where the table holds other policies than a run without choices makes."""
+    shown = {row["policy"] for row in table["policies"] if row["params"]}
+    usual = {v.name for v in bench.plan.variants if v.is_trained and not v.only_when_named}
+    return "" if shown == usual or not shown else f" --policies {','.join(sorted(shown))}"
+
+
 def project_version() -> str:
     """This project's version, with the commit where it runs from a checkout."""
     import subprocess
@@ -177,7 +184,7 @@ def _write_report(bench: Bench, draft) -> Outcome:
         [load_rollouts(plan.folder(u)) for u in rolled],
     )
     provenance = Provenance(
-        command=bench.experiment.command,
+        command=bench.experiment.command + _choice_of_policies(bench, built),
         history=bench.experiment.history,
         version=project_version(),
         made_at=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),

@@ -84,11 +84,15 @@ def run_benchmarks(
 
 
 def _check_source(targets: Sequence[Target], session: Session) -> None:
-    """Fail before any work when a folder is not there."""
+    """Fail before any work when a folder is not there, or is no data set."""
+    from pipeline.lerobot_format.layout import read_layout
     from pipeline.lerobot_format.read import source_stamp
 
     for target in targets:
-        source_stamp(target.experiment.dataset.source, session.config_dir)
+        source = target.experiment.dataset.source
+        source_stamp(source, session.config_dir)
+        if not source.startswith(("embedded:", "hub:")):
+            read_layout(Path(source))
 
 
 def _run_one(target: Target, session: Session) -> dict[str, Any]:
@@ -248,7 +252,7 @@ def inspect_dataset(argument: str, config_path: Path | None, json_to: str | None
 
 def measure_floor(
     argument: str,
-    radius: float,
+    radius: float | None,
     probes: int,
     min_neighbours: int,
     observations: str | None,
@@ -314,10 +318,7 @@ def view_episode(
     predictions = [load_predictions(plan.folder(u)) for u in units if not wanted or u.asset.split("/")[0] in wanted]
     frames = demos.episode(int(position[0]))
     if not any(len(p.in_frames(frames)) for p in predictions):
-        session.console.print(
-            f"Episode {episode} has no predictions: it was not held out, or '{target.key}' was not benchmarked yet "
-            f"(demobench run {argument}). Showing the recording alone."
-        )
+        session.console.print(_why_no_predictions(episode, predictions, demos, target, session), soft_wrap=True)
     path = save or session.store.dataset(target.key) / "view.rrd"
     path.parent.mkdir(parents=True, exist_ok=True)
     to_rerun.write_rerun(path, demos, semantics, predictions, [int(position[0])], name=f"{target.key} {episode}")
@@ -325,6 +326,26 @@ def view_episode(
         session.console.print(f"Written to {save}. Open it with: rerun --bind 127.0.0.1 {save}", soft_wrap=True)
     else:
         to_rerun.view(path)
+
+
+def _why_no_predictions(episode: int, predictions: Sequence[Any], demos: Any, target: Target, session: Session) -> str:
+    """Why an episode is shown as it was recorded, and nothing more."""
+    import numpy as np
+
+    if not predictions:
+        base = target.key.split("+")[0]
+        finished = [
+            key for key in session.store.experiments() if (session.store.folder(key, "benchmark_table")).exists()
+        ]
+        others = [key for key in finished if key.split("+")[0] == base and key != target.key]
+        known = f" There are results of {', '.join(others)}." if others else ""
+        return (
+            f"'{target.key}' has no up-to-date predictions in {session.store.root}; showing the recording alone.{known}"
+        )
+    anchors = np.concatenate([p.anchors for p in predictions])
+    held_out = demos.episode_ids[np.unique(np.searchsorted(demos.episode_starts, anchors, side="right") - 1)]
+    some = ", ".join(map(str, held_out[:10]))
+    return f"Episode {episode} was trained on, so no policy was asked about it; held out are {some}{' …' * (len(held_out) > 10)}"
 
 
 def record_pusht(out: Path, episodes: int, seed: int, workers: int) -> None:

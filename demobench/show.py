@@ -47,13 +47,13 @@ def show_floor(floors: Sequence[RadiusFloor], console: Console) -> None:
     table = Table("observations", "radius", "probes", "median group", "mean", "90th percentile", "unit", title_justify="left",
                   title="Spread of the actions among frames that look alike (estimator: radius)")  # fmt: skip
     for floor in floors:
+        radius = _number(floor.radius, 3) + (" deviations" if floor.scaled else "")
         if floor.refused:
-            table.add_row(escape(floor.observations), _number(floor.radius), str(floor.probes), "—", "—", "—", "")
+            table.add_row(escape(floor.observations), radius, str(floor.probes), "—", "—", "—", "")
             continue
-        radius = _number(floor.radius) + (" deviations" if floor.scaled else "")
         table.add_row(
             escape(floor.observations), radius, str(floor.probes), _number(floor.median_neighbours), f"{floor.mean:.2f}",
-            f"{floor.p90:.2f}", floor.unit or "",
+            f"{floor.p90:.2f}", floor.unit or "?",
         )  # fmt: skip
     console.print(table)
     for floor in floors:
@@ -61,6 +61,7 @@ def show_floor(floors: Sequence[RadiusFloor], console: Console) -> None:
             console.print(f"[yellow]{escape(floor.observations)}:[/] {escape(floor.refused)}", soft_wrap=True)
     console.print(
         "This is the notebook's estimator, kept to reproduce published numbers. It is biased: a group's own mean is inside the "
-        "group, neighbours may be copies in time, only dense places count, and a wide radius adds the variation of the mean.",
+        "group, neighbours may be copies in time, only dense places count, and a wide radius adds the variation of the mean. "
+        "It is an L2 distance, so it bounds no mean absolute error.",
         style="dim",
     )

@@ -127,11 +127,16 @@ def from_config(config: Config, name: str, config_dir: Path) -> Experiment:
         ConfigError: the file has no such data set ("did you mean").
     """
     if name not in config.datasets:
-        raise ConfigError(
-            f"No data set '{name}': it is neither in the configuration, nor a folder, nor hub:owner/name. "
-            f"{did_you_mean(name, config.datasets)}"
-        )
+        raise no_such_dataset(name, config.datasets)
     return _experiment(config, name, config.datasets[name], config_dir)
+
+
+def no_such_dataset(name: str, known: Iterable[str]) -> ConfigError:
+    """The error for a word that names nothing."""
+    return ConfigError(
+        f"No data set '{name}': it is neither in the configuration, nor benchmarked before, nor a folder, nor hub:owner/name. "
+        f"{did_you_mean(name, known)}"
+    )
 
 
 def _experiment(config: Config, name: str, dataset: DatasetConfig, config_dir: Path) -> Experiment:
@@ -227,9 +232,11 @@ def resolve_target(
 def _base(argument: str, config: Config, config_dir: Path, registered: Mapping[str, Any]) -> tuple[str, Experiment]:
     if argument in config.datasets:
         return argument, from_config(config, argument, config_dir)
+    if argument in registered:
+        return argument, Experiment.model_validate(registered[argument])
     is_path = "/" in argument or argument in (".", "..") or Path(argument).is_dir()
     if not (argument.startswith(("hub:", "embedded:")) or is_path):
-        from_config(config, argument, config_dir)  # raises, with "did you mean"
+        raise no_such_dataset(argument, [*config.datasets, *registered])
     source = absolute_source(argument, Path.cwd())
     for name, dataset in config.datasets.items():
         if absolute_source(dataset.source, config_dir) == source:

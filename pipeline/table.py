@@ -278,7 +278,8 @@ def _footnotes(table: Mapping[str, Any]) -> list[str]:
         unit = f" {radius['unit']}" if radius["unit"] else ""
         lines.append(
             f"floor by radius (the notebook's, biased), L2, '{radius['observations']}': "
-            f"mean {radius['mean']:.2f}{unit}, 90th percentile {radius['p90']:.2f}{unit}, {radius['probes']} probes"
+            f"mean {radius['mean']:.2f}{unit}, 90th percentile {radius['p90']:.2f}{unit}, {radius['probes']} probes; "
+            "it bounds no MAE"
         )
     if dataset.get("revision"):
         lines.append(f"revision {dataset['revision'][:12]} · split {table['split']['hash'][:12]}")

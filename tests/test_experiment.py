@@ -103,3 +103,13 @@ def test_chunks_are_zero_padded_and_wrong_chunks_refused():
         variants(parse_config({"policies": {"mlp": {"method": "mlp"}}}, "t").policies)
     with pytest.raises(ConfigError, match="takes none"):
         variants(parse_config({"policies": {"x": {"method": "hold_still", "chunks": [1]}}}, "t").policies)
+
+
+def test_a_data_set_that_was_benchmarked_before_is_found_by_its_key():
+    variant = target(seeds=2)
+    registered = {variant.key: variant.experiment.model_dump(mode="json")}
+    again = target(variant.key, registered)
+    assert again.key == variant.key
+    assert again.experiment == variant.experiment
+    with pytest.raises(ConfigError, match="Did you mean"):
+        target("tap", registered)

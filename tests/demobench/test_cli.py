@@ -122,6 +122,25 @@ def test_mistakes_are_one_message(place, words, expected):
         assert word in " ".join(out.stderr.split())
 
 
+def test_a_folder_that_is_no_data_set_leaves_nothing_behind(place):
+    (place / "plain").mkdir()
+    assert demobench("run", "plain", "--store", "untouched", cwd=place).returncode == 2
+    assert not (place / "untouched").exists()
+
+
+def test_view_finds_a_variant_by_its_key_and_says_why_there_is_nothing(place, first_run):
+    (key,) = [p.name for p in (place / "results" / "datasets").glob("tape+*") if (p / "benchmark_table").exists()]
+    table = json.loads((place / "out.json").read_text())[0]
+    held_out, trained = table["split"]["folds"][0]["test"][0], table["split"]["folds"][0]["train"][0]
+    out = demobench("view", key, held_out, "--save", "variant.rrd", cwd=place)
+    assert out.returncode == 0
+    assert "trained on" not in out.stdout
+    out = demobench("view", key, trained, "--save", "variant.rrd", cwd=place)
+    assert f"Episode {trained} was trained on" in " ".join(out.stdout.split())
+    out = demobench("view", "tape", held_out, "--save", "variant.rrd", cwd=place)
+    assert f"There are results of {key}" in " ".join(out.stdout.split())
+
+
 def test_debug_shows_the_traceback(place):
     out = demobench("run", "nosuch", "--debug", cwd=place)
     assert "Traceback" in out.stderr
