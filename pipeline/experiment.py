@@ -330,10 +330,15 @@ def parse_chunks(text: str | None) -> tuple[int, ...]:
 
 
 def select_rows(rows: Iterable[Mapping[str, Any]], target: Target) -> list[Mapping[str, Any]]:
-    """The rows of a table that a run asked for."""
+    """The rows of a table that a run asked for; a method that sees no observation set is asked for with any."""
     names = {v.name for v in target.selected}
     return [
         row
         for row in rows
-        if row["policy"] in names and (not target.observations or row["observations"] in target.observations)
+        if row["policy"] in names
+        and (
+            not target.observations
+            or row["observations"] in target.observations
+            or not METHODS[row["method"]].uses_observations
+        )
     ]

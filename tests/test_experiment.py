@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.config import Config, parse_config
 from pipeline.errors import ConfigError
-from pipeline.experiment import Choices, parse_chunks, resolve_target, variants
+from pipeline.experiment import Choices, parse_chunks, resolve_target, select_rows, variants
 
 CONFIG = parse_config(
     {
@@ -113,3 +113,16 @@ def test_a_data_set_that_was_benchmarked_before_is_found_by_its_key():
     assert again.experiment == variant.experiment
     with pytest.raises(ConfigError, match="Did you mean"):
         target("tap", registered)
+
+
+def test_rows_of_other_observation_sets_are_left_out_and_baselines_stay():
+    config = parse_config({"policies": {"mlp": {"method": "mlp", "chunks": [1]}}}, "test")
+    asked = resolve_target("pusht_sim", config, HERE, Choices(observations=("pose",)), {})
+    rows = [
+        {"policy": "mlp_k01", "method": "mlp", "observations": "pose"},
+        {"policy": "mlp_k01", "method": "mlp", "observations": "position"},
+        {"policy": "nearest_neighbour", "method": "nearest_neighbour", "observations": "position"},
+        {"policy": "hold_still", "method": "hold_still", "observations": "position"},
+        {"policy": "elsewhere", "method": "mlp", "observations": "pose"},
+    ]
+    assert select_rows(rows, asked) == [rows[0], rows[3]]
