@@ -6,7 +6,7 @@ from pathlib import Path
 import dagster as dg
 
 from assets_defs.plan import Unit
-from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
+from assets_defs.resources import Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import picture, present, table
 
 PARTITIONS = dg.DynamicPartitionsDefinition(name="datasets")
@@ -46,11 +46,13 @@ def demonstrations(
         from pipeline.lerobot_format.read import load_source
         from pipeline.lerobot_format.saved import save_demonstrations
         from pipeline.sinks.pictures import picture_demonstration
+        from pipeline.windows import check_features
 
         dataset = bench.experiment.dataset
         demos = load_source(dataset.source, name=bench.experiment.name, config_dir=workbench.config_dir)
         semantics = resolve_semantics(demos, kind=dataset.kind, circular=dataset.circular)
-        check_observation_sets(bench, demos)
+        for observation_set in bench.experiment.observation_sets:
+            check_features(demos, observation_set)
         save_demonstrations(demos, draft / "frames")
         picture_demonstration(demos, semantics, draft / "trajectories.png")
         stored = hash_again(draft / "frames")
@@ -95,23 +97,6 @@ def hash_again(folder: Path) -> str:
     stored = load_demonstrations(folder)
     arrays = {name: getattr(stored, name) for name in ("episode_starts", "episode_ids", "timestamps", "tasks", "fps")}
     return hash_demonstrations(stored.columns, stored.features, **arrays)
-
-
-def check_observation_sets(bench: Bench, demos) -> None:
-    """Every feature that an observation set names must be in the data.
-
-    Raises:
-        ConfigError: it is not; the message lists what there is.
-    """
-    from pipeline.errors import ConfigError, did_you_mean
-
-    for name, features in bench.experiment.dataset.observations.items():
-        for feature in features:
-            if feature not in demos.columns:
-                raise ConfigError(
-                    f"[datasets.{bench.experiment.name}.observations] {name} names '{feature}', which the data set does "
-                    f"not have. {did_you_mean(feature, demos.columns)}"
-                )
 
 
 @dg.asset(

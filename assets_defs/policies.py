@@ -4,6 +4,9 @@ Baselines go the same way as trained policies. An asset of a policy holds one en
 """
 
 import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
 import dagster as dg
 
@@ -12,6 +15,7 @@ from assets_defs.plan import Unit
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import picture, present, table
 from pipeline.experiment import Variant
+from pipeline.store import Made
 
 TRAINED = """Weights of `{name}`: {what}
 
@@ -37,6 +41,14 @@ def _task(bench: Bench, variant: Variant, unit: Unit):
     return PolicyTask(
         bench.demonstrations, bench.semantics, bench.split, sets[unit.entry], variant, bench.experiment
     )  # fmt: skip
+
+
+def _make_entries(
+    bench: Bench, variant: Variant, kind: str, work: Callable[[Bench, Variant, Unit, Path], Outcome]
+) -> dict[str, Made]:
+    """Every entry of one asset of a policy that is asked for: observation set → what made it."""
+    units = bench.plan.selected_units(variant, kind)
+    return {unit.entry: bench.make(unit, partial(work, bench, variant, unit)) for unit in units}
 
 
 def _everyone(bench: Bench) -> list[str]:
@@ -77,9 +89,7 @@ def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
         context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
     ) -> dg.MaterializeResult:
         bench = workbench.open(context, budget)
-        made = {}
-        for unit in bench.plan.selected_units(variant, "trained_policy"):
-            made[unit.entry] = bench.make(unit, lambda draft, unit=unit: _train(bench, variant, unit, draft))
+        made = _make_entries(bench, variant, "trained_policy", _train)
         rows = [
             (entry, m.summary["parameters"], m.summary["train_s"], m.summary["last_loss"]) for entry, m in made.items()
         ]
@@ -95,7 +105,7 @@ def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
     return trained_policy
 
 
-def _train(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
+def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
     import numpy as np
 
     from pipeline.folds import train_folds
@@ -156,9 +166,7 @@ def _predictions(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDef
         context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
     ) -> dg.MaterializeResult:
         bench = workbench.open(context, budget)
-        made = {}
-        for unit in bench.plan.selected_units(variant, "predictions"):
-            made[unit.entry] = bench.make(unit, lambda draft, unit=unit: _predict(bench, variant, unit, draft))
+        made = _make_entries(bench, variant, "predictions", _predict)
         rows = [
             (
                 entry,
@@ -180,7 +188,7 @@ def _predictions(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDef
     return predictions
 
 
-def _predict(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
+def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
     import numpy as np
 
     from pipeline.folds import predict_folds
@@ -233,9 +241,7 @@ def _rollouts(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDefini
         context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
     ) -> dg.MaterializeResult:
         bench = workbench.open(context, budget)
-        made = {}
-        for unit in bench.plan.selected_units(variant, "rollouts"):
-            made[unit.entry] = bench.make(unit, lambda draft, unit=unit: _roll_out(bench, variant, unit, draft))
+        made = _make_entries(bench, variant, "rollouts", _roll_out)
         rows = []
         for entry, m in made.items():
             r = m.summary["rollouts"]
@@ -246,7 +252,7 @@ def _rollouts(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDefini
     return rollouts
 
 
-def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft) -> Outcome:
+def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
     from pipeline.errors import NotApplicableError
     from pipeline.simulate.trial import roll_out, save_rollouts
     from pipeline.sinks import to_mlflow

@@ -95,12 +95,8 @@ class Workbench:
         if experiment != base:
             key = variant_key(key.split("+")[0], from_base(self, key, base), experiment)
             self.store.register(key, experiment.model_dump(mode="json"))
-        observations = tuple(budget.observations)
-        for name in observations:
-            if name not in experiment.dataset.observations:
-                known = did_you_mean(name, experiment.dataset.observations)
-                raise ConfigError(f"'{key}' has no observation set '{name}'. {known}")
-        plan = Plan(self.store, key, experiment, self.variants, (), observations, look_at_source)
+        experiment.require_sets(budget.observations)
+        plan = Plan(self.store, key, experiment, self.variants, (), tuple(budget.observations), look_at_source)
         return Bench(self, plan, self.progress or Progress(context.log.info))
 
 

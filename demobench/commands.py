@@ -268,9 +268,7 @@ def measure_floor(
     target, demos, semantics = _open_dataset(argument, session)
     sets = {s.name: s for s in target.experiment.observation_sets}
     wanted = parse_list(observations) or tuple(sets)
-    for name in wanted:
-        if name not in sets:
-            raise ConfigError(f"The data set has no observation set '{name}'. {did_you_mean(name, sets)}")
+    target.experiment.require_sets(wanted)
     floors = [
         radius_floor(demos, semantics, sets[name], radius=radius, probes=probes, min_neighbours=min_neighbours)
         for name in wanted

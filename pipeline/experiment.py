@@ -85,6 +85,17 @@ class Experiment(Settings):
         words += ["--folds", str(self.folds)] if self.folds != "auto" else []
         return " ".join(words)
 
+    def require_sets(self, names: Iterable[str]) -> None:
+        """Every name must be one of the data set's observation sets.
+
+        Raises:
+            ConfigError: it is not ("did you mean").
+        """
+        for name in names:
+            if name not in self.dataset.observations:
+                known = did_you_mean(name, self.dataset.observations)
+                raise ConfigError(f"The data set '{self.name}' has no observation set '{name}'. {known}")
+
     def sets_of(self, variant: Variant) -> list[ObservationSet]:
         """The observation sets a policy is asked with on this data set.
 
@@ -216,10 +227,7 @@ def resolve_target(
     base_key, base = _base(argument, config, config_dir, registered)
     changed = with_choices(base, choices)
     selected = _select(changed, choices)
-    for name in choices.observations:
-        if name not in changed.dataset.observations:
-            known = did_you_mean(name, changed.dataset.observations)
-            raise ConfigError(f"The data set '{base_key}' has no observation set '{name}'. {known}")
+    changed.require_sets(choices.observations)
     return Target(
         key=variant_key(base_key, base, changed),
         experiment=changed,

@@ -164,7 +164,7 @@ def make_windows(
     DatasetError : an episode is shorter than the history, or no window fits.
     NotApplicableError : `notebook`, and an action column commands no state column.
     """
-    _check_features(demos, observation_set)
+    check_features(demos, observation_set)
     _check_lengths(demos, history, chunk)
     if protocol == "notebook" and recipe == "arm":
         commanded_columns(demos, semantics)
@@ -190,7 +190,12 @@ def _anchors(demos: Demonstrations, episodes: Sequence[int], first: int, cut: in
     return np.concatenate([np.empty(0, np.int64), *anchors])
 
 
-def _check_features(demos: Demonstrations, observation_set: ObservationSet) -> None:
+def check_features(demos: Demonstrations, observation_set: ObservationSet) -> None:
+    """Every feature that an observation set names must be in the data.
+
+    Raises:
+        ConfigError: it is not ("did you mean").
+    """
     for key in observation_set.features:
         if key not in demos.columns:
             known = [name for name in demos.columns if name != ACTION]
