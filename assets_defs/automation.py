@@ -1,4 +1,4 @@
-"""What runs by itself: two jobs, a weekly schedule, and the sensor that makes the file's data sets appear as partitions."""
+"""What runs by itself (a weekly schedule, and the sensor that makes the file's data sets appear as partitions), and the jobs."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -13,12 +13,15 @@ from pipeline.experiment import Variant
 
 BENCHMARK = "benchmark"
 REBENCHMARK = "rebenchmark"
+CURVE = "curve"
+"""Not part of a benchmark: it trains for longer than one."""
 
 
 def automation(config: Config, policies: Sequence[Variant]) -> dict[str, list[Any]]:
     """The `jobs`, `schedules` and `sensors` of the definitions."""
     named_only = [v.name for v in policies if v.only_when_named]
-    everything = dg.AssetSelection.all() - dg.AssetSelection.groups(*named_only)
+    learning_curve = dg.AssetSelection.assets("learning_curve")
+    everything = dg.AssetSelection.all() - dg.AssetSelection.groups(*named_only) - learning_curve
     benchmark = dg.define_asset_job(
         BENCHMARK,
         selection=everything,
@@ -29,8 +32,14 @@ def automation(config: Config, policies: Sequence[Variant]) -> dict[str, list[An
         selection=everything,
         description="The same, for what is out of date: a result whose data, settings and code did not change is kept.",
     )
+    curve = dg.define_asset_job(
+        CURVE,
+        selection=learning_curve,
+        description="Would more demonstrations help? Trains one policy on parts of the training episodes; its predictions must be "
+        "there. The policy is the data set's champion, or the one named in the launchpad.",
+    )
     return {
-        "jobs": [benchmark, rebenchmark],
+        "jobs": [benchmark, rebenchmark, curve],
         "schedules": [_weekly(config, rebenchmark)],
         "sensors": [register_datasets],
     }

@@ -58,7 +58,9 @@ def _benchmark_table(deps: Sequence[dg.AssetKey], floor: dg.AssetsDefinition) ->
 
 
 def _write_table(bench: Bench, draft) -> Outcome:
-    from pipeline.statistics.floors import load_floors
+    from pipeline.statistics.floors import load_estimates
+    from pipeline.statistics.metrics import load_errors
+    from pipeline.statistics.radius import load_floors
     from pipeline.store import write_json
     from pipeline.table import build_table
 
@@ -72,15 +74,17 @@ def _write_table(bench: Bench, draft) -> Outcome:
             {
                 "variant": next(v for v in plan.variants if v.name == name),
                 "observations": unit.entry,
+                "errors": load_errors(plan.folder(unit) / "errors.safetensors"),
                 **bench.summary(unit),
                 "parameters": trained["parameters"],
                 "train_s": trained["train_s"],
                 "rollouts": bench.summary(rolled).get("rollouts") if plan.is_fresh(rolled) else None,
             }
         )
-    floors = load_floors(plan.folder(Unit("multimodality_floor")) / "floors.json")
+    floor = plan.folder(Unit("multimodality_floor"))
+    floors, estimates = load_floors(floor / "radius.json"), load_estimates(floor / "estimates.json")
     facts = bench.summary(Unit("demonstrations"))["inspect"]
-    built = build_table(facts, bench.experiment, bench.split, floors, entries)
+    built = build_table(facts, bench.experiment, bench.split, floors, estimates, entries)
     write_json(draft / "table.json", built)
     rows = [
         (
@@ -167,13 +171,13 @@ def _write_report(bench: Bench, draft) -> Outcome:
     from pipeline.sinks.markup import outside_references
     from pipeline.sinks.pictures import picture_table
     from pipeline.sinks.report import Provenance, write_report
-    from pipeline.statistics.floors import load_floors
+    from pipeline.statistics.radius import load_floors
 
     plan = bench.plan
     built = json.loads((plan.folder(Unit("benchmark_table")) / "table.json").read_text())
     built["artifacts"] |= {"mcap": "../mcap_log/held_out.mcap", "rerun": "../rerun_recording/held_out.rrd"}
     predictions = [load_predictions(plan.folder(u)) for u in plan.fresh_policy_units("predictions")]
-    floors = load_floors(plan.folder(Unit("multimodality_floor")) / "floors.json")
+    floors = load_floors(plan.folder(Unit("multimodality_floor")) / "radius.json")
     rolled = [u for u in plan.fresh_policy_units("rollouts") if bench.summary(u)["rollouts"]]
     figures = benchmark_figures(
         built,

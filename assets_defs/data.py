@@ -120,17 +120,10 @@ def episode_split(
     bench = workbench.open(context, budget)
 
     def split(draft):
-        from pipeline.split import make_split, save_split
+        from pipeline.folds import split_of
+        from pipeline.split import save_split
 
-        e = bench.experiment
-        made = make_split(
-            bench.demonstrations,
-            protocol=e.protocol,
-            folds=e.folds,
-            test_share=e.test_share,
-            seed=e.split_seed,
-            has_simulator=e.dataset.simulator is not None,
-        )
+        made = split_of(bench.experiment, bench.demonstrations)
         save_split(made, draft / "split.json")
         shared = sum(len(set(f.train) & set(f.test)) for f in made.folds)
         sizes = [(len(f.train), len(f.test)) for f in made.folds]

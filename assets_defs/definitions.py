@@ -13,6 +13,7 @@ import dagster as dg
 from assets_defs import data, floor
 from assets_defs.automation import automation
 from assets_defs.benchmark import benchmark_assets
+from assets_defs.curve import curve_assets
 from assets_defs.looking import looking_assets
 from assets_defs.policies import policy_assets
 from assets_defs.resources import Budget, Workbench
@@ -57,6 +58,7 @@ def build_defs(
         *data.ASSETS,
         *floor.ASSETS,
         *branches,
+        *curve_assets(predictions),
         *benchmark_assets([*predictions, *rollouts], floor.multimodality_floor),
         *looking_assets(predictions),
     ]

@@ -1,10 +1,12 @@
 """The floor: how small can the error of any deterministic policy get on these demonstrations?"""
 
+from pathlib import Path
+
 import dagster as dg
 
-from assets_defs.data import PARTITIONS, demonstrations
+from assets_defs.data import PARTITIONS, demonstrations, episode_split
 from assets_defs.plan import FLOOR, Unit
-from assets_defs.resources import Budget, Outcome, Workbench, check_spec, code_version, result
+from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import picture, present, table
 
 KEY = dg.AssetKey(["multimodality_floor"])
@@ -14,52 +16,72 @@ KEY = dg.AssetKey(["multimodality_floor"])
     partitions_def=PARTITIONS,
     group_name="floor",
     kinds={"numpy", "scipy"},
-    deps=[demonstrations],
+    deps=[demonstrations, episode_split],
     code_version=code_version("multimodality_floor"),
     check_specs=[check_spec(KEY, "answered_or_refused", "Every floor is a finite number or says why there is none.")],
 )
 def multimodality_floor(
     context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
 ) -> dg.MaterializeResult:
-    """The spread of actions among frames that look alike: an error that no deterministic policy can go below.
+    """How small the error of any deterministic policy can get: people do different things in the same place.
 
-    `radius` is the notebook's estimator, kept to reproduce published numbers. It is biased: it counts each group's own mean,
-    copies in time, and the variation of the mean within the radius.
+    One floor for every observation set, horizon and loss, on the states where policies are scored: `gamma` for the squared
+    error, `pair_distance` for the others; or the reason why there is none. What a policy sees decides what looks alike, so a
+    floor for joints says nothing about a policy that sees a camera. `radius` is the notebook's estimator, kept to reproduce
+    published numbers; it is biased.
     """
     bench = workbench.open(context, budget)
-
-    def measure(draft):
-        from pipeline.sinks.pictures import picture_neighbourhood
-        from pipeline.statistics.floors import radius_floor, save_floors
-
-        sets = bench.experiment.observation_sets
-        floors = [radius_floor(bench.demonstrations, bench.semantics, s, **FLOOR) for s in sets]
-        save_floors(floors, draft / "floors.json")
-        for floor in floors:
-            name = f"neighbourhood_{floor.observations}.png"
-            picture_neighbourhood(bench.demonstrations, bench.semantics, floor, draft / name)
-        rows = [
-            (f.observations, f.radius, f.probes, f.median_neighbours, f.mean, f.p90, f.unit, f.refused) for f in floors
-        ]
-        sound = all(f.refused or (f.mean == f.mean and f.mean >= 0) for f in floors)
-        return Outcome(
-            {"rows": [[None if v != v else v for v in row] for row in rows]},
-            {
-                "answered_or_refused": (
-                    sound,
-                    "; ".join(f"{f.observations}: {f.refused or f'{f.mean:.4g}'}" for f in floors),
-                )
-            },
-        )
-
     unit = Unit("multimodality_floor")
-    made = bench.make(unit, measure)
-    header = ["observations", "radius", "probes", "median group", "mean", "90th percentile", "unit", "refused"]
+    made = bench.make(unit, lambda draft: _measure(bench, draft))
     folder = bench.plan.folder(unit)
-    pictures = {f"neighbourhood_{s.name}": picture(folder / f"neighbourhood_{s.name}.png") for s in
-                bench.experiment.observation_sets}  # fmt: skip
-    metadata = {"floor": table(header, made.summary["rows"]), **pictures}
+    pictures = {
+        f"neighbourhood_{s.name}": picture(folder / f"neighbourhood_{s.name}.png")
+        for s in bench.experiment.observation_sets
+    }
+    header = ["observations", "horizon", "loss", "floor", "not above", "95 % interval", "refused"]
+    old = ["observations", "radius", "probes", "median group", "mean", "90th percentile", "unit", "refused"]
+    metadata = {
+        "floors": table(header, made.summary["estimates"]),
+        "radius (the notebook's)": table(old, made.summary["rows"]),
+        **pictures,
+    }
     return result(bench, KEY, {"": made}, present(metadata), ["answered_or_refused"])
+
+
+def _measure(bench: Bench, draft: Path) -> Outcome:
+    from pipeline.sinks.pictures import picture_neighbourhood
+    from pipeline.statistics.floors import measure_floors, save_estimates
+    from pipeline.statistics.radius import radius_floor, save_floors
+
+    demos, semantics, sets = bench.demonstrations, bench.semantics, bench.experiment.observation_sets
+    floors = [radius_floor(demos, semantics, s, **FLOOR) for s in sets]
+    save_floors(floors, draft / "radius.json")
+    for floor in floors:
+        picture_neighbourhood(demos, semantics, floor, draft / f"neighbourhood_{floor.observations}.png")
+    history, horizons = bench.experiment.history, bench.experiment.floor_horizons(demos.fps)
+    estimates = []
+    for done, s in enumerate(sets):
+        bench.progress("floors", done, len(sets), s.name)
+        estimates += measure_floors(demos, semantics, s, bench.split, history=history, horizons=horizons)
+    save_estimates(estimates, draft / "estimates.json")
+    rows = [(f.observations, f.radius, f.probes, f.median_neighbours, f.mean, f.p90, f.unit, f.refused) for f in floors]
+    sound = all(f.refused or (f.mean == f.mean and f.mean >= 0) for f in floors)
+    sound &= all((e.value is None) != (e.refused is None) for e in estimates)
+    answered = sum(e.value is not None for e in estimates)
+    return Outcome(
+        {
+            "rows": [[None if v != v else v for v in row] for row in rows],
+            "estimates": [
+                (e.observations, e.horizon, e.loss, e.value, e.upper or e.below, _words(e.interval), e.refused)
+                for e in estimates
+            ],
+        },
+        {"answered_or_refused": (sound, f"{answered} of {len(estimates)} floors have a value; the rest say why not")},
+    )
+
+
+def _words(interval: tuple[float, float] | None) -> str | None:
+    return f"{interval[0]:.4g} … {interval[1]:.4g}" if interval else None
 
 
 ASSETS = [multimodality_floor]

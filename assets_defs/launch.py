@@ -8,7 +8,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -124,16 +124,21 @@ def run_benchmark(
     observations: Sequence[str] = (),
     policies: Sequence[str] = (),
     on_event: Callable[[dg.DagsterEvent], None] | None = None,
+    *,
+    job_name: str = BENCHMARK,
+    ops: Mapping[str, Any] | None = None,
 ) -> dg.DagsterRun:
     """Run the selected assets of one partition in this process; returns the finished run.
 
-    `observations` and `policies` are what was asked for, where that is not everything. `on_event` sees every Dagster event
-    as it happens. Ctrl-C ends the run as CANCELED and is raised again.
+    `observations` and `policies` are what was asked for, where that is not everything; `ops` the settings of single assets.
+    `on_event` sees every Dagster event as it happens. Ctrl-C ends the run as CANCELED and is raised again.
     """
     instance.add_dynamic_partitions(str(PARTITIONS.name), [partition])
     selection = set(assets)
-    job = defs.resolve_job_def(BENCHMARK).get_subset(asset_selection=selection)
-    run_config = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
+    job = defs.resolve_job_def(job_name).get_subset(asset_selection=selection)
+    run_config: dict[str, Any] = {"loggers": {"console": {"config": {"log_level": "CRITICAL"}}}}
+    if ops:
+        run_config["ops"] = {name: {"config": dict(settings)} for name, settings in ops.items()}
     asked = {"observations": list(observations), "policies": list(policies)}
     run_config["resources"] = {"budget": {"config": {name: value for name, value in asked.items() if value}}}
     run = instance.create_run_for_job(
@@ -145,7 +150,7 @@ def run_benchmark(
             PID_TAG: str(os.getpid()),
             HOST_TAG: socket.gethostname(),
         },
-        remote_job_origin=_job_origin(),
+        remote_job_origin=_job_origin(job_name),
         job_code_origin=None,
     )
     interrupted = False
@@ -174,8 +179,8 @@ def _is_interrupt(event: dg.DagsterEvent) -> bool:
     return False
 
 
-def _job_origin() -> RemoteJobOrigin:
+def _job_origin(job_name: str) -> RemoteJobOrigin:
     """Where the UI finds this job: the same module and location name as in workspace.yaml."""
     target = LoadableTargetOrigin(executable_path=sys.executable, module_name=MODULE, working_directory=str(Path.cwd()))
     location = ManagedGrpcPythonEnvCodeLocationOrigin(target, LOCATION)
-    return RemoteJobOrigin(RemoteRepositoryOrigin(location, "__repository__"), BENCHMARK)
+    return RemoteJobOrigin(RemoteRepositoryOrigin(location, "__repository__"), job_name)

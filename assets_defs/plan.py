@@ -7,6 +7,7 @@ a run (which assets to select), by every asset's body (whether there is work), a
 What belongs here: which settings and inputs matter to which asset. What does not: doing the work.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -21,12 +22,13 @@ CODE_VERSIONS = {
     "demonstrations": "1",
     "episode_split": "1",
     "windows": "1",
-    "multimodality_floor": "1",
+    "multimodality_floor": "2",
+    "learning_curve": "1",
     "trained_policy": "1",
-    "predictions": "1",
+    "predictions": "2",
     "rollouts": "1",
-    "benchmark_table": "1",
-    "benchmark_report": "1",
+    "benchmark_table": "2",
+    "benchmark_report": "2",
     "mcap_log": "1",
     "rerun_recording": "1",
 }
@@ -112,10 +114,16 @@ class Plan:
         """After results were made: look at the store again."""
         self._memo.clear()
 
-    def stale(self) -> dict[Unit, str]:
-        """Every result of the selection that must be made again, and why, in the order of the work."""
+    def curve_units(self, curves: Sequence[Unit]) -> list[Unit]:
+        """Learning curves and every result that they are made from, inputs first."""
+        predictions = [u for curve in curves for u in self.inputs(curve) if u.kind == "predictions"]
+        trained = [u for p in predictions for u in self.inputs(p)]
+        return [*(Unit(asset) for asset in DATA), *trained, *predictions, *curves]
+
+    def stale(self, units: Sequence[Unit] | None = None) -> dict[Unit, str]:
+        """Every result of the selection (or of `units`) that must be made again, and why, in the order of the work."""
         why: dict[Unit, str] = {}
-        for unit in self.units():
+        for unit in self.units() if units is None else units:
             behind = [i for i in self.inputs(unit) if i in why]
             if behind:
                 why[unit] = f"{_words(behind[0])} is made again"
@@ -168,15 +176,18 @@ class Plan:
         match unit.kind:
             case "demonstrations":
                 return []
-            case "episode_split" | "multimodality_floor":
+            case "episode_split":
                 return [data]
-            case "windows":
+            case "windows" | "multimodality_floor":
                 return [data, Unit("episode_split")]
             case "trained_policy":
                 # Not the `windows` asset: it covers every chunk size of the file, and a new one must not retrain the rest.
                 return [data, Unit("episode_split")]
             case "predictions" | "rollouts":
                 return [Unit(unit.asset.replace(unit.kind, "trained_policy"), unit.entry)]
+            case "learning_curve":
+                policy, observations, _ = unit.entry.split("/")
+                return [Unit("episode_split"), Unit("multimodality_floor"), Unit(f"{policy}/predictions", observations)]
             case "benchmark_table":
                 kinds = ("predictions", "rollouts")
                 policies = [u for kind in kinds for v in self.variants for u in self.policy_units(v, kind)]
@@ -195,7 +206,12 @@ class Plan:
             case "windows":
                 return _dump(e, {"protocol", "history"}) | {"largest_chunk": e.largest_chunk}
             case "multimodality_floor":
-                return {"floor": FLOOR, "observations": e.dataset.observations}
+                settings = {
+                    "floor": FLOOR,
+                    "observations": e.dataset.observations,
+                    "horizons": e.dataset.floor_horizons,
+                }
+                return settings | _dump(e, {"history"})
             case "trained_policy":
                 variant = self._variant_named[unit.asset.split("/")[0]]
                 settings = {"method": variant.method, "chunk": variant.chunk, "windows": CODE_VERSIONS["windows"]}
@@ -210,9 +226,20 @@ class Plan:
             case "rollouts":
                 return {"simulator": _installed(e.dataset.simulator), "rollouts": e.rollouts}
             case "benchmark_table":
-                return {"name": e.name, "budget": e.budget_words}
+                return {"name": e.name, "budget": e.budget_words, "champion": e.dataset.champion}
             case _:
                 return {}
+
+
+def curve_unit(policy: str, observations: str, sizes: Sequence[int] = ()) -> Unit:
+    """A learning curve: of one policy with one observation set over the sizes asked for, which none overwrites."""
+    return Unit("learning_curve", f"{policy}/{observations}/{'-'.join(map(str, sorted(set(sizes)))) or 'default'}")
+
+
+def sizes_of(curve: Unit) -> tuple[int, ...]:
+    """The inverse of `curve_unit`, for the sizes."""
+    words = curve.entry.split("/")[-1]
+    return () if words == "default" else tuple(int(size) for size in words.split("-"))
 
 
 def _depends_on_set(variant: Variant) -> bool:

@@ -98,23 +98,128 @@ def inspect(
 
 
 @app.command(
-    epilog="Examples:\n\n    demobench floor my/lerobot/folder\n\n"
-    "    demobench floor pusht --radius 2 --probes 2000 --min-neighbours 5"
+    epilog="Examples:\n\n    demobench floor my/lerobot/folder\n\n    demobench floor tape --horizons 0,15,30 --json -\n\n"
+    "    demobench floor pusht --radius 2 --probes 2000 --min-neighbours 5      the notebook's settings"
 )
 def floor(
     dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
     radius: Annotated[
         float | None,
-        typer.Option(min=1e-12, help="Frames within this distance are neighbours; left out, a close one is chosen."),
+        typer.Option(min=1e-12, help="The notebook's: frames within this distance are neighbours; else a close one."),
     ] = None,
-    probes: Annotated[int, typer.Option(min=1, help="Frames, evenly spaced, whose neighbours are looked for.")] = 2000,
-    min_neighbours: Annotated[int, typer.Option(min=2, help="Probes with fewer frames around them do not count.")] = 5,
+    probes: Annotated[
+        int, typer.Option(min=1, help="The notebook's: frames, evenly spaced, whose neighbours are looked for.")
+    ] = 2000,
+    min_neighbours: Annotated[
+        int, typer.Option(min=2, help="The notebook's: probes with fewer frames around them do not count.")
+    ] = 5,
     observations: Annotated[str | None, typer.Option(help="Only these observation sets.")] = None,
+    horizons: Annotated[
+        str | None, typer.Option(help="Steps ahead: 0,15,30; else the first action and one second ahead.")
+    ] = None,
     config: ConfigOption = None,
     json_to: JsonOption = None,
 ) -> None:
-    """How far apart are the actions people took in the same place? An L2 distance: no bound on a mean absolute error."""
-    commands.measure_floor(dataset, radius, probes, min_neighbours, observations, config, json_to)
+    """How small can the error of a deterministic policy get here? People do different things in the same place."""
+    commands.measure_floor(
+        dataset,
+        radius=radius,
+        probes=probes,
+        min_neighbours=min_neighbours,
+        observations=observations,
+        horizons=horizons,
+        config_path=config,
+        json_to=json_to,
+    )
+
+
+@app.command(
+    context_settings={"ignore_unknown_options": True},  # so that "-3/20" is answered in our own words
+    epilog="Examples:\n\n    demobench success 18/20 16/20\n\n    demobench success trials.csv --json -",
+)
+def success(
+    counts: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="COUNT … | TRIALS.csv", help="Successes of trials (18/20), or a CSV: policy, start state, success."
+        ),
+    ],
+    json_to: JsonOption = None,
+) -> None:
+    """Success rates of real-robot trials: how sure each is, which policy is better, and how many trials would tell."""
+    from demobench.success import judge_success
+
+    judge_success(counts, json_to)
+
+
+@app.command(
+    epilog="Examples:\n\n    demobench compare tape/mlp_k01 tape/mlp_k16\n\n"
+    "    demobench compare tape                            all pairs of its table\n\n"
+    "    demobench compare pusht_sim/mlp_k01/pose@1f3a pusht_sim/mlp_k01/position --json -"
+)
+def compare(
+    addresses: Annotated[
+        list[str],
+        typer.Argument(metavar="A [B …]", help="Results: dataset/policy[/observations][@run], or a data set for all."),
+    ],
+    config: ConfigOption = None,
+    store: StoreOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Which policy is better? Paired over held-out episodes: better, worse, cannot tell, or not comparable, and why."""
+    from demobench.compare import compare_policies
+
+    compare_policies(addresses, config, store, json_to)
+
+
+@app.command(
+    epilog="""Examples:\n
+    demobench curve pusht_sim                                    would 50 more demonstrations help?\n
+    demobench curve my/lerobot/folder --policy mlp_k16 --more 100\n
+    demobench curve pusht_sim --policy mlp_k01 --observations pose --sizes 20,40,80 --json -"""
+)
+def curve(
+    dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
+    policy: Annotated[
+        str | None, typer.Option(help="The policy; else the data set's champion, else the first that is trained.")
+    ] = None,
+    observations: Annotated[str | None, typer.Option(help="Only these observation sets: position,pose")] = None,
+    sizes: Annotated[
+        str | None, typer.Option(help="Training episodes: 10,20,40; else about an eighth, a quarter and a half of all.")
+    ] = None,
+    more: Annotated[int, typer.Option(min=1, help="How many more demonstrations are in question.")] = 50,
+    worthwhile: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="The share of the present error that is worth recording for.")
+    ] = 0.05,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Training seeds.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Training steps, the same at every size.")] = None,
+    budget: Annotated[
+        BudgetName | None, typer.Option(help="quick (600 steps), standard (3,000) or thorough (20,000).")
+    ] = None,
+    folds: Annotated[int | None, typer.Option(min=1, help="Folds of the split by episode.")] = None,
+    protocol: Annotated[Protocol | None, typer.Option(help="strict, or notebook.")] = None,
+    device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="auto, cpu or cuda.")] = None,
+    config: ConfigOption = None,
+    store: StoreOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Would more demonstrations help? Yes, no, or cannot tell: error against the number of training episodes."""
+    from demobench.curve import run_curve
+
+    run_curve(
+        dataset,
+        policy=policy,
+        sizes=sizes,
+        more=more,
+        worthwhile=worthwhile,
+        choices={
+            "observations": observations, "seeds": seeds, "steps": steps, "budget": budget, "folds": folds,
+            "protocol": protocol, "device": device,
+        },
+        config_path=config,
+        store_path=store,
+        json_to=json_to,
+    )  # fmt: skip
 
 
 @app.command(epilog="Examples:\n\n    demobench view pusht_sim 0\n\n    demobench view pusht_sim 0 --save episode.rrd")
@@ -128,6 +233,30 @@ def view(
 ) -> None:
     """Look at one episode in Rerun: what was recorded, and what every policy would have done."""
     commands.view_episode(dataset, episode, policy, save, config, store)
+
+
+@app.command(epilog="Examples:\n\n    demobench selftest\n\n    demobench selftest --full --page docs/known_truth.md")
+def selftest(
+    full: Annotated[
+        bool, typer.Option("--full/--quick", help="All of it, half an hour; or what shows a broken estimator.")
+    ] = False,
+    page: Annotated[
+        Path | None, typer.Option(help="Write the report, a Markdown page with its plots beside it.")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    config: ConfigOption = None,
+    store: StoreOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Are the statistics right? Every estimator and interval against data whose truth is known. Resumable.
+
+    The exit status is 1 where a goal is missed.
+    """
+    from demobench.selftest import run_selftest
+
+    passed = run_selftest(full=full, workers=workers, page=page, config_path=config, store_path=store, json_to=json_to)
+    if not passed:
+        raise typer.Exit(1)
 
 
 @app.command(epilog="Examples:\n\n    demobench ui\n\n    demobench ui --port 3001 --mlflow-port 5001")

@@ -13,7 +13,15 @@ from rich.console import Console
 
 from pipeline.config import Config, find_config, load_config
 from pipeline.errors import ConfigError, StoreError, did_you_mean
-from pipeline.experiment import Choices, Target, parse_chunks, parse_list, resolve_target, select_rows
+from pipeline.experiment import (
+    Choices,
+    Target,
+    parse_chunks,
+    parse_horizons,
+    parse_list,
+    resolve_target,
+    select_rows,
+)
 from pipeline.store import Store, write_json
 
 
@@ -77,13 +85,13 @@ def run_benchmarks(
         raise ConfigError("The configuration has no data sets. Name one: demobench run some/lerobot/folder")
     registered = session.store.experiments()
     targets = [resolve_target(n, session.config, session.config_dir, chosen, registered) for n in names]
-    _check_source(targets, session)
+    check_source(targets, session)
     session.store.ensure()
     results = [_run_one(target, session) for target in targets]
     write_json_to(json_to, results)
 
 
-def _check_source(targets: Sequence[Target], session: Session) -> None:
+def check_source(targets: Sequence[Target], session: Session) -> None:
     """Fail before any work when a folder is not there, or is no data set."""
     from pipeline.lerobot_format.layout import read_layout
     from pipeline.lerobot_format.read import source_stamp
@@ -111,7 +119,7 @@ def _run_one(target: Target, session: Session) -> dict[str, Any]:
         store.register(target.key, target.experiment.model_dump(mode="json"))
         stale = plan.stale()
         if stale:
-            _materialise(target, session, list(stale))
+            materialise(target, session, list(stale))
         else:
             console.print(f"[bold]{target.key}[/] is up to date: nothing to compute.")
     plan.forget()
@@ -120,12 +128,27 @@ def _run_one(target: Target, session: Session) -> dict[str, Any]:
     return report
 
 
-def _materialise(target: Target, session: Session, stale: Sequence[Any]) -> None:
+def materialise(
+    target: Target,
+    session: Session,
+    stale: Sequence[Any],
+    *,
+    job: str | None = None,
+    ops: Mapping[str, Any] | None = None,
+) -> None:
+    """Make stale results as a Dagster run of a job (the benchmark by default) with bars; `ops` are settings of single assets.
+
+    Raises:
+        StoreError: the run's log cannot be written.
+        DemobenchError: what the run failed for.
+        typer.Exit: Ctrl-C.
+    """
     from sqlalchemy.exc import SQLAlchemyError
 
     from demobench.progress import RunProgress
 
     with RunProgress(session.console, target, stale) as progress:
+        from assets_defs.automation import BENCHMARK
         from assets_defs.definitions import build_defs
         from assets_defs.launch import Interrupts, close_dead_runs, open_instance, run_benchmark
         from assets_defs.resources import asset_keys
@@ -154,6 +177,8 @@ def _materialise(target: Target, session: Session, stale: Sequence[Any]) -> None
                     target.observations,
                     [v.name for v in target.selected],
                     progress.on_event,
+                    job_name=job or BENCHMARK,
+                    ops=ops,
                 )
             except KeyboardInterrupt:
                 progress.stop()
@@ -191,14 +216,14 @@ def _show(report: Mapping[str, Any], target: Target, session: Session) -> None:
     render_table(report, console)
     paths = report["artifacts"]
     opens = {
-        "report": f"xdg-open {_short(paths['report'])}",
-        "mcap": f"{_program('rerun')} --bind 127.0.0.1 {_short(paths['mcap'])}",
-        "rerun": f"{_program('rerun')} --bind 127.0.0.1 {_short(paths['rerun'])}",
+        "report": f"xdg-open {short(paths['report'])}",
+        "mcap": f"{_program('rerun')} --bind 127.0.0.1 {short(paths['mcap'])}",
+        "rerun": f"{_program('rerun')} --bind 127.0.0.1 {short(paths['rerun'])}",
         "mlflow": f"{_program('demobench')} ui",
     }
     names = {"report": "Report", "mcap": "MCAP", "rerun": "Rerun", "mlflow": "MLflow"}
     for kind, name in names.items():
-        console.print(f"  {name:<7}{_short(paths[kind])}", soft_wrap=True)
+        console.print(f"  {name:<7}{short(paths[kind])}", soft_wrap=True)
         console.print(f"         [dim]open with:[/] {opens[kind]}", soft_wrap=True)
     if not target.file_has_it:
         console.print(
@@ -211,10 +236,10 @@ def _program(name: str) -> str:
     """How to call a program that was installed beside this one: by name where that finds it, else by its path."""
     here = Path(sys.executable).parent / name
     found = shutil.which(name)
-    return name if found and Path(found).resolve() == here.resolve() else _short(str(here))
+    return name if found and Path(found).resolve() == here.resolve() else short(str(here))
 
 
-def _short(path: str) -> str:
+def short(path: str) -> str:
     """Relative to the working directory where that is shorter."""
     prefix, plain = ("sqlite:///", path.removeprefix("sqlite:///")) if path.startswith("sqlite:///") else ("", path)
     try:
@@ -252,31 +277,42 @@ def inspect_dataset(argument: str, config_path: Path | None, json_to: str | None
 
 def measure_floor(
     argument: str,
+    *,
     radius: float | None,
     probes: int,
     min_neighbours: int,
     observations: str | None,
+    horizons: str | None,
     config_path: Path | None,
     json_to: str | None,
 ) -> None:
-    from demobench.show import show_floor
+    """The floors of the states that a benchmark would score, and the notebook's."""
+    from demobench.show import show_estimates, show_radius
+    from pipeline.folds import split_of
     from pipeline.lerobot_format import quality
-    from pipeline.statistics.floors import radius_floor
+    from pipeline.statistics.floors import measure_floors
+    from pipeline.statistics.radius import radius_floor
     from pipeline.table import dataset_json, floor_json
 
     session = open_session(config_path, None, json_to)
+    asked = parse_horizons(horizons)
     target, demos, semantics = _open_dataset(argument, session)
-    sets = {s.name: s for s in target.experiment.observation_sets}
+    experiment = target.experiment
+    sets = {s.name: s for s in experiment.observation_sets}
     wanted = parse_list(observations) or tuple(sets)
-    target.experiment.require_sets(wanted)
+    experiment.require_sets(wanted)
     floors = [
         radius_floor(demos, semantics, sets[name], radius=radius, probes=probes, min_neighbours=min_neighbours)
         for name in wanted
     ]
+    split = split_of(experiment, demos)
+    settings = {"history": experiment.history, "horizons": asked or experiment.floor_horizons(demos.fps)}
+    estimates = [e for name in wanted for e in measure_floors(demos, semantics, sets[name], split, **settings)]
     facts = quality.inspect_dataset(demos, semantics)
     if json_to != "-":
-        show_floor(floors, session.console)
-    write_json_to(json_to, {"dataset": dataset_json(facts), "floor": floor_json(floors)})
+        show_estimates(estimates, facts, session.console)
+        show_radius(floors, session.console)
+    write_json_to(json_to, {"dataset": dataset_json(facts), "floor": floor_json(floors, estimates)})
 
 
 # view, record ---------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.types import RadiusFloor
+from pipeline.types import FloorEstimate, RadiusFloor
 
 
 def _number(value: float | None, digits: int = 4) -> str:
@@ -42,8 +42,41 @@ def show_inspection(facts: Mapping[str, Any], console: Console) -> None:
         console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
 
 
-def show_floor(floors: Sequence[RadiusFloor], console: Console) -> None:
-    """Every floor in a row, and what the estimator is worth."""
+LOSSES = {"rmse": "RMSE", "mae": "MAE", "l2": "L2"}
+
+
+def show_estimates(estimates: Sequence[FloorEstimate], facts: Mapping[str, Any], console: Console) -> None:
+    """Every floor in a row: a value with its interval, the span it lies in, or what it does not exceed and why."""
+    units = set(facts["action_units"])
+    unit = (next(iter(units)) or "unit not stated") if len(units) == 1 else "mixed units"
+    table = Table("observations", "frames", "steps ahead", "loss", "floor", "95 % interval", title_justify="left",
+                  title=f"How small the error of a deterministic policy can get ({escape(unit)})")  # fmt: skip
+    reasons: dict[str, None] = {}
+    for floor in estimates:
+        if floor.refused:
+            reasons[floor.refused] = None
+            number = f"[yellow]({list(reasons).index(floor.refused) + 1})[/]"
+            value = f"not above {_number(floor.below)} {number}" if floor.below is not None else f"— {number}"
+        elif floor.upper is not None:
+            value = f"{_number(floor.value)} … {_number(floor.upper)}"
+        else:
+            value = f"[bold]{_number(floor.value)}[/]"
+        interval = f"{_number(floor.interval[0])} … {_number(floor.interval[1])}" if floor.interval else "—"
+        table.add_row(
+            escape(floor.observations), str(floor.history), str(floor.horizon), LOSSES[floor.loss], value, interval
+        )
+    console.print(table)
+    for number, reason in enumerate(reasons, 1):
+        console.print(f"[yellow]({number})[/] {escape(reason)}", soft_wrap=True)
+    console.print(
+        "A floor belongs to its observation set: a policy that sees more may go below it. RMSE: squared errors, extrapolated to "
+        "states that look exactly alike (gamma). MAE and L2: the floor lies between the two ends (pair distance).\n",
+        style="dim",
+    )
+
+
+def show_radius(floors: Sequence[RadiusFloor], console: Console) -> None:
+    """The notebook's floors, a row each, and what that estimator is worth."""
     table = Table("observations", "radius", "probes", "median group", "mean", "90th percentile", "unit", title_justify="left",
                   title="Spread of the actions among frames that look alike (estimator: radius)")  # fmt: skip
     for floor in floors:

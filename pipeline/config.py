@@ -71,13 +71,22 @@ class BenchmarkConfig(Settings):
     executor: Literal["in_process"] = "in_process"
 
 
+class ObservationConfig(Settings):
+    """An observation set that sees another number of frames than the benchmark's history."""
+
+    features: tuple[str, ...]
+    history: Annotated[int, Field(ge=1, le=1000)] | None = None
+
+
 class DatasetConfig(Settings):
     source: str
     simulator: Literal["pusht"] | None = None
     budget: BudgetName | None = None
     kind: Literal["auto"] | ActionKind | dict[str, ActionKind] = "auto"
     circular: tuple[str, ...] | None = None
-    observations: dict[str, tuple[str, ...]] = {"state": ("observation.state",)}
+    observations: dict[str, tuple[str, ...] | ObservationConfig] = {"state": ("observation.state",)}
+    champion: str | None = None
+    floor_horizons: tuple[Annotated[int, Field(ge=0, le=10_000)], ...] | None = None
 
 
 class PolicyConfig(Settings):

@@ -16,6 +16,7 @@ from pipeline.config import (
     BudgetName,
     Config,
     DatasetConfig,
+    ObservationConfig,
     PolicyConfig,
     Settings,
     check_slug,
@@ -61,7 +62,13 @@ class Experiment(Settings):
 
     @property
     def observation_sets(self) -> list[ObservationSet]:
-        return [ObservationSet(name, features) for name, features in self.dataset.observations.items()]
+        sets = self.dataset.observations.items()
+        return [
+            ObservationSet(name, seen.features, seen.history)
+            if isinstance(seen, ObservationConfig)
+            else ObservationSet(name, seen)
+            for name, seen in sets
+        ]
 
     @property
     def variants(self) -> list[Variant]:
@@ -70,6 +77,10 @@ class Experiment(Settings):
     @property
     def largest_chunk(self) -> int:
         return max((v.chunk or 1 for v in self.variants), default=1)
+
+    def floor_horizons(self, fps: float) -> tuple[int, ...]:
+        """How many steps ahead floors are measured: as the file says, else at the first action and one second ahead."""
+        return self.dataset.floor_horizons or (0, round(fps))
 
     @property
     def budget_words(self) -> str:
@@ -156,7 +167,7 @@ def _experiment(config: Config, name: str, dataset: DatasetConfig, config_dir: P
     steps = BUDGETS[budget]
     if benchmark.steps is not None and dataset.budget is None:
         budget, steps = None, benchmark.steps
-    return Experiment(
+    made = Experiment(
         name=name,
         dataset=dataset.model_copy(update={"source": absolute_source(dataset.source, config_dir)}),
         policies=dict(BASELINES) | dict(config.policies),
@@ -172,6 +183,20 @@ def _experiment(config: Config, name: str, dataset: DatasetConfig, config_dir: P
         threads=benchmark.threads,
         device=benchmark.device,
     )
+    _check_champion(made)
+    return made
+
+
+def _check_champion(experiment: Experiment) -> None:
+    """The champion is a policy of the experiment, with one of its observation sets where one is named."""
+    if experiment.dataset.champion is None:
+        return
+    policy, _, observations = experiment.dataset.champion.partition("/")
+    names = [v.name for v in experiment.variants]
+    if policy not in names:
+        raise ConfigError(f"[datasets.{experiment.name}] champion: no policy '{policy}'. {did_you_mean(policy, names)}")
+    if observations:
+        experiment.require_sets([observations])
 
 
 def absolute_source(source: str, config_dir: Path) -> str:
@@ -323,18 +348,23 @@ def parse_list(text: str | None) -> tuple[str, ...]:
 
 
 def parse_chunks(text: str | None) -> tuple[int, ...]:
-    """`"1,16"` → `(1, 16)`.
+    """`"1,16"` → `(1, 16)`; a ConfigError where something is not a whole number of at least 1."""
+    return _parse_numbers("--chunks", text, 1)
 
-    Raises:
-        ConfigError: something is not a whole number of at least 1.
-    """
+
+def parse_horizons(text: str | None) -> tuple[int, ...]:
+    """`"0,30"` → `(0, 30)`; a ConfigError where something is not a whole number of at least 0."""
+    return _parse_numbers("--horizons", text, 0)
+
+
+def _parse_numbers(option: str, text: str | None, least: int) -> tuple[int, ...]:
     try:
-        chunks = tuple(int(part) for part in parse_list(text))
+        numbers = tuple(int(part) for part in parse_list(text))
     except ValueError:
-        chunks = (0,)
-    if any(chunk < 1 for chunk in chunks):
-        raise ConfigError(f"--chunks takes whole numbers of at least 1, separated by commas, not '{text}'.")
-    return chunks
+        numbers = (least - 1,)
+    if any(number < least for number in numbers):
+        raise ConfigError(f"{option} takes whole numbers of at least {least}, separated by commas, not '{text}'.")
+    return numbers
 
 
 def select_rows(rows: Iterable[Mapping[str, Any]], target: Target) -> list[Mapping[str, Any]]:

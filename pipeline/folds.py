@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.experiment import Experiment, Variant
 from pipeline.lerobot_format.quality import dead_columns
 from pipeline.methods import METHODS
+from pipeline.split import make_split
 from pipeline.types import ACTION, Demonstrations, Fold, ObservationSet, Predictions, Semantics, Split
 from pipeline.windows import Windows, make_windows
 
@@ -46,6 +47,7 @@ class PolicyTask:
 
     def windows(self, episodes: Iterable[int], fold: Fold) -> Windows:
         """The anchors of some episodes, normalised by what this fold may learn from."""
+        method = METHODS[self.variant.method]
         return make_windows(
             self.demos,
             self.semantics,
@@ -55,8 +57,21 @@ class PolicyTask:
             protocol=self.experiment.protocol,
             history=self.experiment.history,
             chunk=self.variant.chunk or 1,
-            recipe=METHODS[self.variant.method].recipe,
+            recipe=method.recipe,
+            own_history=self.observation_set.history if method.uses_observations else None,
         )
+
+
+def split_of(experiment: Experiment, demos: Demonstrations) -> Split:
+    """The folds that an experiment's settings give these demonstrations."""
+    return make_split(
+        demos,
+        protocol=experiment.protocol,
+        folds=experiment.folds,
+        test_share=experiment.test_share,
+        seed=experiment.split_seed,
+        has_simulator=experiment.dataset.simulator is not None,
+    )
 
 
 def train_folds(

@@ -16,6 +16,7 @@ class Method:
                        can be asked for any horizon and is scored on all
     trained            it has seeds and training steps (and is rolled out where there is a simulator)
     uses_observations  its answer depends on the observation set; else it runs once a data set
+    frames             frames of `observation.state` that a method without an observation set looks at
     recipe             which windows it is made for (`windows.Recipe`)
     """
 
@@ -24,6 +25,7 @@ class Method:
     chunk: Literal["set", "one", "none"] = "none"
     trained: bool = False
     uses_observations: bool = True
+    frames: int = 0
     recipe: Literal["arm", "every_frame"] = "arm"
 
     def load_class(self) -> type:
@@ -31,9 +33,11 @@ class Method:
 
 
 METHODS: dict[str, Method] = {
-    "hold_still": Method("pipeline.policies.hold_still", "HoldStill", uses_observations=False),
+    "hold_still": Method("pipeline.policies.hold_still", "HoldStill", uses_observations=False, frames=1),
     "mean_action": Method("pipeline.policies.mean_action", "MeanAction", uses_observations=False),
-    "constant_velocity": Method("pipeline.policies.constant_velocity", "ConstantVelocity", uses_observations=False),
+    "constant_velocity": Method(
+        "pipeline.policies.constant_velocity", "ConstantVelocity", uses_observations=False, frames=2
+    ),
     "nearest_neighbour": Method("pipeline.policies.nearest_neighbour", "NearestNeighbour"),
     "mlp": Method("pipeline.policies.mlp", "Mlp", chunk="set", trained=True),
     "notebook_pusht": Method(

@@ -167,10 +167,10 @@ class Store:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON whole or not at all."""
+    """Write JSON whole or not at all; keys keep their order, which means something (observation sets, joints)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
-    draft.write_text(json.dumps(value, indent=1, sort_keys=True, allow_nan=False), encoding="utf-8")
+    draft.write_text(json.dumps(value, indent=1, allow_nan=False), encoding="utf-8")
     draft.replace(path)
 
 

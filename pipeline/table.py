@@ -4,14 +4,16 @@ What belongs here: putting facts, scores, floors and roll-outs into the shape th
 drawing it. What does not: working any of them out.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.experiment import Experiment
-from pipeline.types import RadiusFloor, Split
+from pipeline.statistics.brackets import Scored, Sight, form_brackets, gap_to_floor, sight_of, value_of_sensors
+from pipeline.statistics.comparisons import table_comparisons
+from pipeline.types import FloorEstimate, RadiusFloor, Split
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,6 +22,7 @@ METRICS = (
     "first_step_mae", "first_step_rmse", "first_step_l2", "at_one_second_mae", "at_one_second_rmse",
     "whole_chunk_mae", "whole_chunk_rmse", "ensembled_first_step_mae", "error_by_horizon", "rmse_by_horizon",
     "hold_still_by_horizon", "error_by_joint", "vs_hold_still", "scaled", "scaled_by_joint", "interval",
+    "interval_method",
 )  # fmt: skip
 """What a row takes over from a policy's score."""
 
@@ -29,15 +32,17 @@ def build_table(
     experiment: Experiment,
     split: Split,
     floors: Sequence[RadiusFloor],
-    entries: Iterable[Mapping[str, Any]],
+    estimates: Sequence[FloorEstimate],
+    entries: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
     """The table of one data set.
 
     Parameters
     ----------
     facts : what `quality.inspect_dataset` found.
-    entries : one a row: `variant`, `observations`, `metrics` (`metrics.Score.metrics`), `windows_train`,
-        `windows_test`, `latency_ms`, `parameters`, `train_s` and `rollouts` (a summary or None).
+    floors, estimates : the notebook's floors, and those that policies are held against.
+    entries : one a row: `variant`, `observations`, `metrics` (`metrics.Score.metrics`), `errors` (`EpisodeErrors`),
+        `windows_train`, `windows_test`, `latency_ms`, `parameters`, `train_s` and `rollouts` (a summary or None).
 
     Returns
     -------
@@ -45,6 +50,8 @@ def build_table(
     """
     rows = [_row(entry, experiment) for entry in entries]
     rows.sort(key=_best_first)
+    comparisons = _compare(rows, facts, experiment, entries)
+    against_floors = _against_floors(rows, facts, experiment, estimates, entries)
     table = {
         "dataset": dataset_json(facts),
         "protocol": experiment.protocol,
@@ -53,9 +60,10 @@ def build_table(
             "hash": split.hash,
             "folds": [{"train": list(fold.train), "test": list(fold.test)} for fold in split.folds],
         },
-        "floor": floor_json(floors),
-        "brackets": [],
+        "floor": floor_json(floors, estimates),
+        **against_floors,
         "policies": rows,
+        "comparisons": comparisons,
         "artifacts": {"report": None, "mcap": None, "rerun": None, "mlflow": None},
     }
     return json_safe(table)
@@ -70,7 +78,72 @@ def dataset_json(facts: Mapping[str, Any]) -> dict[str, Any]:
     return json_safe({key: facts[key] for key in keys})
 
 
-def floor_json(floors: Sequence[RadiusFloor]) -> dict[str, Any]:
+def _compare(
+    rows: Sequence[dict[str, Any]],
+    facts: Mapping[str, Any],
+    experiment: Experiment,
+    entries: Sequence[Mapping[str, Any]],
+) -> list[dict[str, Any]]:
+    """Every row against hold-still and against the champion; the words go into the rows' `verdict`."""
+    scored = [(entry["variant"].name, entry["observations"], entry["errors"]) for entry in entries]
+    champion = experiment.dataset.champion
+    baselines = [entry["variant"].name for entry in entries if not entry["variant"].is_trained]
+    found = table_comparisons(scored, champion, facts["fps"], experiment.protocol, baselines=baselines)
+    by_address = {f"{row['policy']}/{row['observations']}": row for row in rows}
+    for comparison in found:
+        rival = "vs_hold_still" if comparison.b.startswith("hold_still/") else "vs_champion"
+        rivals = (
+            [rival, "vs_champion"] if champion and comparison.b.split("/")[0] == champion.split("/")[0] else [rival]
+        )
+        ahead = "_at_one_second" if comparison.metric == "at_one_second_mae" else ""
+        for name in rivals:
+            by_address[comparison.a]["verdict"][name + ahead] = comparison.word
+    return [asdict(comparison) for comparison in found]
+
+
+def _against_floors(
+    rows: Sequence[dict[str, Any]],
+    facts: Mapping[str, Any],
+    experiment: Experiment,
+    estimates: Sequence[FloorEstimate],
+    entries: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    """`brackets` and `sensors`; each row's `above_floor` is filled in. `notebook` averages otherwise, so it has none."""
+    if experiment.protocol == "notebook" or not estimates:
+        return {"brackets": [], "sensors": []}
+    history, kinds = experiment.history, facts["action_kinds"]
+    sets = {s.name: s for s in experiment.observation_sets}
+    sights = {name: Sight(frozenset(s.features), s.history or history) for name, s in sets.items()}
+    scored = [
+        Scored(
+            e["variant"].name,
+            e["observations"],
+            sight_of(e["variant"], sets[e["observations"]], history, kinds),
+            e["errors"],
+        )
+        for e in entries
+    ]
+    brackets = form_brackets(estimates, scored, sights)
+    sound = {(b["observations"], b["horizon"], b["loss"]) for b in brackets if b["lower"] is not None}
+    by_address = {f"{row['policy']}/{row['observations']}": row for row in rows}
+    for one in scored:
+        row = by_address[f"{one.policy}/{one.observations}"]
+        for floor in estimates:
+            key = (floor.observations, floor.horizon, floor.loss)
+            if (
+                floor.observations != one.observations
+                or key not in sound
+                or not one.sight.within(sights[one.observations])
+            ):
+                continue
+            if (gap := gap_to_floor(one, floor)) is not None:
+                row["above_floor"].append(
+                    {"horizon": floor.horizon, "loss": floor.loss, "floor": floor.value, **asdict(gap)}
+                )
+    return {"brackets": brackets, "sensors": value_of_sensors(estimates, sights, brackets)}
+
+
+def floor_json(floors: Sequence[RadiusFloor], measured: Sequence[FloorEstimate] = ()) -> dict[str, Any]:
     """The `floor` object: the notebook's estimate of the first observation set, then all estimates."""
     radius = None
     if floors:
@@ -86,6 +159,10 @@ def floor_json(floors: Sequence[RadiusFloor]) -> dict[str, Any]:
         }
         for floor in floors
     ]  # fmt: skip
+    keys = (
+        "observations", "history", "horizon", "loss", "estimator", "value", "upper", "interval", "below", "refused", "nearest"
+    )  # fmt: skip
+    estimates += [{key: getattr(floor, key) for key in keys} for floor in measured]
     return json_safe({"radius": radius, "estimates": estimates})
 
 
@@ -103,7 +180,13 @@ def _row(entry: Mapping[str, Any], experiment: Experiment) -> dict[str, Any]:
         "params": entry["parameters"],
         "train_s": entry["train_s"],
         "latency_ms": entry["latency_ms"],
-        "verdict": {"vs_hold_still": None, "vs_champion": None},
+        "verdict": {
+            "vs_hold_still": None,
+            "vs_champion": None,
+            "vs_hold_still_at_one_second": None,
+            "vs_champion_at_one_second": None,
+        },
+        "above_floor": [],
         "rollouts": entry["rollouts"],
     }
 

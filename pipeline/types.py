@@ -123,10 +123,14 @@ class Semantics:
 
 @dataclass(frozen=True)
 class ObservationSet:
-    """The features a policy sees, by name: `pose = ["observation.state", "observation.environment_state"]`."""
+    """The features a policy sees, by name: `pose = ["observation.state", "observation.environment_state"]`.
+
+    history  the frames of them that it sees, oldest first; None: as many as the benchmark's history
+    """
 
     name: str
     features: tuple[str, ...]
+    history: int | None = None
 
 
 @dataclass(frozen=True)
@@ -234,6 +238,35 @@ class RadiusFloor:
     unit: str | None
     crowded: Neighbourhood | None
     refused: str | None
+
+
+@dataclass(frozen=True)
+class FloorEstimate:
+    """How small the error of a deterministic policy of an observation set can get, or why that cannot be said.
+
+    loss         rmse (of the squared error), mae and l2, as the metrics of the same names
+    value        the floor; for `pair_distance` the lower end of where it lies; None where refused
+    upper        the upper end of where it lies; None for `gamma`, which estimates the floor itself
+    interval     95 %: of the value, or of the whole span from value to upper
+    below        where refused: what the floor does not exceed (one-sided 95 %), if that can be said
+    influence    [E] how much each episode moved the estimate on the squared scale (Γ, or D₀²)
+    counted_twice  the part of Σ influence² that is counted twice (`floors.standard_error`)
+    nearest      the mean distance of the nearest neighbours, in deviations of one input column
+    """
+
+    observations: str
+    history: int
+    horizon: int
+    loss: Literal["rmse", "mae", "l2"]
+    estimator: Literal["gamma", "pair_distance"]
+    value: float | None
+    upper: float | None
+    interval: tuple[float, float] | None
+    below: float | None
+    refused: str | None
+    influence: np.ndarray
+    counted_twice: float
+    nearest: float
 
 
 @dataclass(frozen=True)

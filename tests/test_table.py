@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pipeline.statistics.floors import radius_floor
+from pipeline.statistics.radius import radius_floor
 from pipeline.table import build_table, dataset_json, floor_json, json_safe, render_table
 from tests.hand_made import STATE_ONLY, random_walks, semantics
 from tests.statistics.test_metrics import scored, task_of

@@ -20,7 +20,7 @@ from pipeline.methods import METHODS
 from pipeline.normalize import circular_columns, frames_of
 from pipeline.policies import Plan
 from pipeline.predict import join_folds, predict_policy, temporal_ensemble
-from pipeline.statistics.intervals import Interval, mean_interval
+from pipeline.statistics.intervals import Mean, estimate_mean
 from pipeline.types import ACTION, Demonstrations, EpisodeErrors, Predictions, Protocol, Semantics, Split
 
 
@@ -103,8 +103,8 @@ def summarise(errors: EpisodeErrors, *, protocol: Protocol, fps: float, chunk: i
     Returns
     -------
     dict : `first_step_mae|rmse|l2`, `at_one_second_mae|rmse`, `whole_chunk_mae|rmse`, `scaled` (floats or None),
-        `error_by_horizon`, `rmse_by_horizon` [H], `error_by_joint`, `scaled_by_joint` [A] (NaN where dead) and
-        `interval`, a dict of metric → (low, high) or None.
+        `error_by_horizon`, `rmse_by_horizon` [H], `error_by_joint`, `scaled_by_joint` [A] (NaN where dead),
+        `interval`, a dict of metric → (low, high) or None, and `interval_method`, "bootstrap-t", "t" or None.
     """
     second = round(fps)
     reached = errors.anchors.shape[1]
@@ -115,17 +115,17 @@ def summarise(errors: EpisodeErrors, *, protocol: Protocol, fps: float, chunk: i
         del spans["whole_chunk"]
     optional = ("at_one_second", "whole_chunk")
     found: dict[str, Any] = {f"{name}_{kind}": None for name in optional for kind in ("mae", "rmse")}
-    interval: dict[str, Interval | None] = {f"{name}_mae": None for name in optional}
+    means: dict[str, Mean] = {}
     for name, span in spans.items():
         absolute, counts = span_means(errors, errors.absolute, span)
         squared, _ = span_means(errors, errors.squared, span)
         found[f"{name}_mae"] = estimate(absolute.mean(axis=2), counts, protocol)
         found[f"{name}_rmse"] = float(np.sqrt(estimate(squared.mean(axis=2), counts, protocol)))
-        interval[f"{name}_mae"] = _interval(absolute.mean(axis=2), counts, protocol)
+        means[f"{name}_mae"] = _mean(absolute.mean(axis=2), counts, errors.fold, protocol)
     l2, counts = span_means(errors, errors.l2[..., None], slice(0, 1))
     found["first_step_l2"] = estimate(l2[..., 0], counts, protocol)
-    interval["first_step_l2"] = _interval(l2[..., 0], counts, protocol)
-    return found | _by_joint(errors, protocol) | _by_horizon(errors, protocol) | {"interval": interval}
+    means["first_step_l2"] = _mean(l2[..., 0], counts, errors.fold, protocol)
+    return found | _by_joint(errors, protocol) | _by_horizon(errors, protocol) | _intervals(means, optional)
 
 
 def span_means(errors: EpisodeErrors, sums: np.ndarray, span: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -165,9 +165,17 @@ def _by_joint(errors: EpisodeErrors, protocol: Protocol) -> dict[str, Any]:
     }
 
 
-def _interval(values: np.ndarray, counts: np.ndarray, protocol: Protocol) -> Interval | None:
+def _mean(values: np.ndarray, counts: np.ndarray, fold: np.ndarray, protocol: Protocol) -> Mean:
+    """What `estimate` gives, with its interval."""
     use = counts > 0
-    return mean_interval(values[:, use], counts[use] if protocol == "notebook" else None)
+    return estimate_mean(values[:, use], counts[use] if protocol == "notebook" else None, fold[use])
+
+
+def _intervals(means: dict[str, Mean], optional: tuple[str, ...]) -> dict[str, Any]:
+    """The intervals of all metrics, None for those that a policy does not have, and how that of the first step was made."""
+    missing = {f"{name}_mae": None for name in optional if f"{name}_mae" not in means}
+    intervals = {name: mean.interval for name, mean in means.items()} | missing
+    return {"interval": intervals, "interval_method": means["first_step_mae"].method}
 
 
 @dataclass(frozen=True)
@@ -243,6 +251,8 @@ def _plain(metrics: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
     for metric, value in metrics.items():
         if metric == "interval":
             plain[metric] = {name: None if pair is None else list(pair) for name, pair in value.items()}
+        elif metric == "interval_method":
+            plain[metric] = value
         elif metric == "error_by_joint":
             plain[metric] = {name: finite(number) for name, number in zip(names, value, strict=True)}
         elif metric == "scaled_by_joint":

@@ -193,7 +193,7 @@ def test_ctrl_c_leaves_no_debris_and_the_next_run_goes_on(place):
 
 
 def test_help_has_examples(place):
-    for command in (["run"], ["inspect"], ["floor"], ["view"], ["ui"], ["record", "pusht"]):
+    for command in (["run"], ["inspect"], ["floor"], ["curve"], ["view"], ["ui"], ["record", "pusht"]):
         out = demobench(*command, "--help", cwd=place)
         assert "Example" in out.stdout, command
         assert f"demobench {' '.join(command)}" in out.stdout.split("Example")[1], command

@@ -10,6 +10,7 @@ from pipeline.config import BenchmarkConfig, Config, DatasetConfig
 from pipeline.experiment import from_config
 from pipeline.folds import PolicyTask, predict_folds, train_folds
 from pipeline.split import make_split
+from pipeline.statistics.intervals import estimate_mean
 from pipeline.statistics.metrics import episode_errors, load_errors, save_errors, score_task, summarise
 from pipeline.types import ACTION, STATE, Fold, Predictions, Split
 from pipeline.windows import make_windows
@@ -203,6 +204,11 @@ def test_every_policy_is_held_against_hold_still_on_its_own_anchors(tmp_path):
     assert np.mean(by_seed) == pytest.approx(metrics["first_step_mae"])
     low, high = metrics["interval"]["first_step_mae"]
     assert low < metrics["first_step_mae"] < high
+    assert metrics["interval_method"] == "t"
+    errors = score.errors
+    mean = estimate_mean(errors.absolute[:, :, 0].mean(axis=2) / errors.anchors[:, 0], None, errors.fold)
+    assert (low, high) == pytest.approx(mean.interval)
+    assert mean.seed_df == len(np.unique(errors.fold)) == 5, "two seeds, five folds"
 
 
 @pytest.mark.parametrize(("variant", "windows", "own"), [("mlp_k01", 2_960, 2.5497), ("mlp_k32", 2_650, 2.8033)])
