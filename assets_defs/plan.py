@@ -28,7 +28,7 @@ CODE_VERSIONS = {
     "predictions": "2",
     "rollouts": "1",
     "benchmark_table": "2",
-    "benchmark_report": "2",
+    "benchmark_report": "3",
     "mcap_log": "1",
     "rerun_recording": "1",
 }

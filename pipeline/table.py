@@ -11,12 +11,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.experiment import Experiment
+from pipeline.sinks.findings import (
+    MARKS,
+    NOT_HELD,
+    Strong,
+    address,
+    answer,
+    champion,
+    families_words,
+    first_step_gap,
+    gap_parts,
+    interval_words,
+    not_held,
+    without_floor,
+)
 from pipeline.statistics.brackets import Scored, Sight, form_brackets, gap_to_floor, sight_of, value_of_sensors
 from pipeline.statistics.comparisons import table_comparisons
 from pipeline.types import FloorEstimate, RadiusFloor, Split
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.text import Text
 
 METRICS = (
     "first_step_mae", "first_step_rmse", "first_step_l2", "at_one_second_mae", "at_one_second_rmse",
@@ -212,7 +227,7 @@ def json_safe(value: Any) -> Any:
 
 
 def render_table(table: Mapping[str, Any], console: "Console") -> None:
-    """Draw the table, best first step on top, with what its numbers rest on below it."""
+    """Draw the table, best first step on top; below it the answer in words, and what its numbers rest on."""
     from rich.markup import escape
 
     dataset = table["dataset"]
@@ -225,12 +240,22 @@ def render_table(table: Mapping[str, Any], console: "Console") -> None:
     )
     grid, left_out = _grid(table, unit, console)
     console.print(grid)
+    for sentence in answer(table):
+        console.print(_styled(sentence))
+    console.print()
     narrow = [f"left out for want of width: {', '.join(left_out)} (all in --json)"] if left_out else []
     for line in (*_footnotes(table), *narrow):
         console.print(line, style="dim", soft_wrap=True)
     for warning in dataset["warnings"]:
         console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
     console.print()
+
+
+def _styled(sentence: Sequence[str]) -> "Text":
+    """A sentence with what stands out in bold; names of a data set are text, never markup."""
+    from rich.text import Text
+
+    return Text.assemble(*((part, "bold" if isinstance(part, Strong) else "") for part in sentence))
 
 
 @dataclass(frozen=True)
@@ -244,7 +269,7 @@ class _Column:
 
 def _grid(table: Mapping[str, Any], unit: str | None, console: "Console") -> tuple[Any, list[str]]:
     """The table as wide as the console allows, and the heads of the columns that had to be left out."""
-    columns, left_out = _columns(table["policies"], unit), []
+    columns, left_out = _columns(table, unit), []
     while True:
         grid = _draw(table["policies"], columns)
         expendable = [column for column in columns if column.gives_way]
@@ -267,10 +292,11 @@ def _draw(rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column]):
     return grid
 
 
-def _columns(rows: Sequence[Mapping[str, Any]], unit: str | None) -> list[_Column]:
+def _columns(table: Mapping[str, Any], unit: str | None) -> list[_Column]:
     """From left to right, those that have something to show."""
     from rich.markup import escape
 
+    rows = table["policies"]
     in_unit = f"\n{unit}" if unit else ""
 
     def number(key: str, digits: int = 4) -> Callable[[Mapping[str, Any]], str]:
@@ -283,15 +309,19 @@ def _columns(rows: Sequence[Mapping[str, Any]], unit: str | None) -> list[_Colum
         _Column("policy", lambda row: escape(row["policy"])),
         _Column("sees", lambda row: escape(row["observations"])),
         _Column(f"first step\nMAE{in_unit}", _first_step),
-        _Column(f"\nRMSE{in_unit}", number("first_step_rmse"), 4),
         _Column("\n× hold-still", number("vs_hold_still", 3)),
+        *_verdicts(table),
+        _Column(f"\nRMSE{in_unit}", number("first_step_rmse"), 4),
     ]
+    if any(first_step_gap(row) for row in rows):
+        columns.append(_Column("above floor\nRMSE", _above_floor, 9))
     if any(len(row["error_by_joint"]) == 2 for row in rows):
-        columns.insert(4, _Column(f"\nL2{in_unit}", number("first_step_l2"), 8))
+        columns.append(_Column(f"\nL2{in_unit}", number("first_step_l2"), 8))
     if unit is None:
         columns.append(_Column("\nscaled", number("scaled", 3), 5))
+    if any(row["at_one_second_mae"] is not None for row in rows):
+        columns.append(_Column(f"at 1 s\nMAE{in_unit}", _at_one_second, 10))
     optional = [
-        ("at_one_second_mae", f"at 1 s\nMAE{in_unit}", 9),
         ("whole_chunk_mae", f"whole chunk\nMAE{in_unit}", 7),
         ("ensembled_first_step_mae", f"ensembled\nMAE{in_unit}", 6),
     ]
@@ -299,13 +329,54 @@ def _columns(rows: Sequence[Mapping[str, Any]], unit: str | None) -> list[_Colum
         _Column(head, number(key), way) for key, head, way in optional if any(row[key] is not None for row in rows)
     ]
     if any(row["rollouts"] for row in rows):
-        columns += [_Column("success", _success), _Column("score", score, 10)]
+        columns += [_Column("success", _success), _Column("score", score, 11)]
     return [
         *columns,
         _Column("params", lambda row: f"{row['params']:,}" if row["params"] else "—", 3),
         _Column("trained\ns", lambda row: f"{row['train_s']:,.0f}" if row["params"] else "—", 1),
         _Column("call\nms", number("latency_ms", 2), 2),
     ]
+
+
+def _verdicts(table: Mapping[str, Any]) -> list[_Column]:
+    """What the tests say of the first step; a column without a word is left out."""
+    rows, named = table["policies"], champion(table)
+    heads = {"vs_hold_still": ("against\nhold-still", 13), "vs_champion": ("against\nchampion", 12)}
+
+    def word(row: Mapping[str, Any], rival: str) -> str:
+        if rival == "vs_champion" and address(row) == named:
+            return "champion"
+        return _verdict(row["verdict"][rival])
+
+    return [
+        _Column(head, lambda row, rival=rival: word(row, rival), way)
+        for rival, (head, way) in heads.items()
+        if any(row["verdict"][rival] for row in rows)
+    ]
+
+
+COLOURS = {"better": "green", "worse": "red", "cannot tell": "yellow", "not comparable": "dim"}
+
+
+def _verdict(word: str | None, *, mark_only: bool = False) -> str:
+    if word is None:
+        return "—"
+    return f"[{COLOURS[word]}]{MARKS[word]}{'' if mark_only else f' {word}'}[/]"
+
+
+def _above_floor(row: Mapping[str, Any]) -> str:
+    gap = first_step_gap(row)
+    if gap is None:
+        return "—"
+    short, beside = gap_parts(gap)
+    beside = beside.strip("[]").replace(", ", "–")
+    return f"{short} [dim]{beside}[/]" if beside else short
+
+
+def _at_one_second(row: Mapping[str, Any]) -> str:
+    """The error, with the mark of its verdict against hold-still at the same horizon."""
+    value, word = _number(row["at_one_second_mae"]), row["verdict"]["vs_hold_still_at_one_second"]
+    return f"{value} {_verdict(word, mark_only=True)}" if word else value
 
 
 def _number(value: float | None, digits: int = 4) -> str:
@@ -341,21 +412,23 @@ def _units_words(dataset: Mapping[str, Any]) -> str:
 
 
 def _footnotes(table: Mapping[str, Any]) -> list[str]:
-    budget, folds, dataset = table["budget"], table["split"]["folds"], table["dataset"]
-    name = f"{budget['name']}, " if budget["name"] else ""
-    held_out = sum(len(fold["test"]) for fold in folds)
-    split = f"{len(folds)} folds" if len(folds) > 1 else f"1 fold, {len(folds[0]['train'])} episodes train"
-    over = "episodes, each counts once" if table["protocol"] == "strict" else "frames"
-    has_interval = any(row["interval"].get("first_step_mae") for row in table["policies"])
-    interval = "interval: t over held-out episodes, 95 %" if has_interval else "no interval below 5 held-out episodes"
-    lines = [
-        f"protocol {table['protocol']} · budget {name}{budget['seeds']} seed{'s' * (budget['seeds'] != 1)} × "
-        f"{budget['steps']:,} steps · {split}, {held_out} held out",
-        f"mean over {over}, averaged over seeds · {interval} · × hold-still above 1 beats standing still",
-    ]
+    lines = [_setting(table), _means(table)]
+    if any(row["verdict"]["vs_hold_still"] for row in table["policies"]):
+        lines.append(
+            f"against: paired tests over episodes and seeds, {families_words(table)} ✓ better, ✗ worse, ? cannot tell; "
+            "at 1 s: against hold-still"
+        )
     if any(row["rollouts"] for row in table["policies"]):
         trials = max(row["rollouts"]["n"] for row in table["policies"] if row["rollouts"])
         lines.append(f"success: {trials} start states, one network, Clopper–Pearson 95 % · score: mean best reward")
+    if any(first_step_gap(row) for row in table["policies"]):
+        lines.append(
+            "above floor: the first action's RMSE less the least that a policy of what it sees can have (gamma); "
+            "none where a baseline sees more than the set it stands with"
+        )
+    lines += [f"no floor of '{name}' at the first action: {why}" for name, why in without_floor(table).items()]
+    if not_held(table):
+        lines.append(NOT_HELD)
     radius = table["floor"]["radius"]
     if radius and radius["mean"] is not None:
         unit = f" {radius['unit']}" if radius["unit"] else ""
@@ -364,6 +437,25 @@ def _footnotes(table: Mapping[str, Any]) -> list[str]:
             f"mean {radius['mean']:.2f}{unit}, 90th percentile {radius['p90']:.2f}{unit}, {radius['probes']} probes; "
             "it bounds no MAE"
         )
-    if dataset.get("revision"):
-        lines.append(f"revision {dataset['revision'][:12]} · split {table['split']['hash'][:12]}")
+    if table["dataset"].get("revision"):
+        lines.append(f"revision {table['dataset']['revision'][:12]} · split {table['split']['hash'][:12]}")
     return lines
+
+
+def _setting(table: Mapping[str, Any]) -> str:
+    budget, folds = table["budget"], table["split"]["folds"]
+    name = f"{budget['name']}, " if budget["name"] else ""
+    held_out = sum(len(fold["test"]) for fold in folds)
+    split = f"{len(folds)} folds" if len(folds) > 1 else f"1 fold, {len(folds[0]['train'])} episodes train"
+    return (
+        f"protocol {table['protocol']} · budget {name}{budget['seeds']} seed{'s' * (budget['seeds'] != 1)} × "
+        f"{budget['steps']:,} steps · {split}, {held_out} held out"
+    )
+
+
+def _means(table: Mapping[str, Any]) -> str:
+    over = "episodes, each counts once" if table["protocol"] == "strict" else "frames"
+    return (
+        f"mean over {over}, averaged over seeds · {interval_words(table)} · × hold-still above 1: a smaller error than "
+        "standing still"
+    )

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from pipeline.statistics.floors import measure_floors
 from pipeline.statistics.radius import radius_floor
 from pipeline.table import build_table, dataset_json, floor_json, json_safe, render_table
 from tests.hand_made import STATE_ONLY, random_walks, semantics
+from tests.sinks.making import make_comparison, make_demos, make_gap, make_semantics, make_table, make_verdict
 from tests.statistics.test_metrics import scored, task_of
 
 ROLLOUTS = {"n": 50, "successes": 21, "success": 0.42, "success_interval": [0.28, 0.57], "score": 0.83}
@@ -17,7 +19,7 @@ ROW = {
     "policy", "method", "chunk", "observations", "seeds", "windows_train", "windows_test", "first_step_mae",
     "first_step_rmse", "first_step_l2", "at_one_second_mae", "whole_chunk_mae", "error_by_horizon",
     "hold_still_by_horizon", "error_by_joint", "params", "train_s", "latency_ms", "vs_hold_still", "scaled", "interval",
-    "verdict", "rollouts",
+    "interval_method", "verdict", "above_floor", "rollouts",
 }  # fmt: skip
 
 
@@ -40,12 +42,14 @@ def table(tmp_path_factory):
         score, predictions = scored(task, tmp_path_factory.mktemp(variant))
         entries.append({
             "variant": task.variant, "observations": "state", "metrics": score.metrics, "windows_train": 240,
-            "windows_test": len(predictions.anchors), "latency_ms": 0.1, "parameters": 7 * task.variant.is_trained,
+            "windows_test": len(predictions.anchors), "errors": score.errors, "latency_ms": 0.1,
+            "parameters": 7 * task.variant.is_trained,
             "train_s": 1.5, "rollouts": ROLLOUTS if variant == "mlp_k01" else None,
         })  # fmt: skip
     entries[0]["metrics"]["first_step_rmse"] = float("nan")
     floors = [radius_floor(demos, semantics(demos), STATE_ONLY, min_neighbours=2)]
-    return build_table(facts_of(demos, semantics(demos)), task.experiment, task.split, floors, entries)
+    estimates = measure_floors(demos, semantics(demos), STATE_ONLY, task.split, history=3, horizons=(0, 10))
+    return build_table(facts_of(demos, semantics(demos)), task.experiment, task.split, floors, estimates, entries)
 
 
 def test_it_has_the_shape_that_is_promised(table):
@@ -54,11 +58,22 @@ def test_it_has_the_shape_that_is_promised(table):
         "name", "revision", "content_hash", "episodes", "frames", "fps", "action_names", "action_units", "action_kinds",
         "tracking_lag", "warnings",
     }  # fmt: skip
-    assert table["brackets"] == []
+    assert {bracket["words"] for bracket in table["brackets"]} == {
+        "refused: 6 episodes are too few to find neighbours in; a floor needs 30"
+    }
+    assert table["sensors"] == []
+    assert {(c["a"], c["b"], c["metric"]) for c in table["comparisons"]} == {
+        ("mlp_k32/state", "hold_still/state", "first_step_mae"), ("mlp_k01/state", "hold_still/state", "first_step_mae"),
+        ("mlp_k32/state", "hold_still/state", "at_one_second_mae"),
+    }  # fmt: skip
     assert {"probes", "median_neighbours", "mean", "p90"} <= set(table["floor"]["radius"])
     for row in table["policies"]:
         assert set(row) >= ROW
-        assert row["verdict"] == {"vs_hold_still": None, "vs_champion": None}
+        assert set(row["verdict"]) == {
+            "vs_hold_still", "vs_champion", "vs_hold_still_at_one_second", "vs_champion_at_one_second",
+        }  # fmt: skip
+        assert (row["verdict"]["vs_hold_still"] is None) == (row["policy"] == "hold_still")
+        assert row["above_floor"] == []
         assert len(row["error_by_horizon"]) == len(row["hold_still_by_horizon"])
         assert set(row["error_by_joint"]) == {"a0", "a1"}
     held_out = [episode for fold in table["split"]["folds"] for episode in fold["test"]]
@@ -88,16 +103,19 @@ def test_what_does_not_apply_is_null(table):
 
 
 def drawn(table, width: int) -> str:
+    """What a console of that width shows; a sentence may go on in the next line."""
     out = StringIO()
     render_table(table, Console(file=out, width=width, color_system=None))
     return out.getvalue()
 
 
 def test_a_reader_sees_what_the_numbers_rest_on(table):
-    text = drawn(table, 170)
+    text = drawn(table, 200)
     for words in (
         "[bold]tape[/]", "px", "mlp_k01", "state", "42 % 28–57", "—", "5 folds, 6 held out", "2 seeds × 5 steps",
-        "protocol strict", "t over held-out episodes", "Clopper–Pearson", "floor by radius",
+        "protocol strict", "95 % interval: t over held-out episodes and seeds, for these folds", "Clopper–Pearson",
+        "floor by radius", "3 comparisons in one family", "no floor of 'state' at the first action: 6 episodes are too few",
+        "against", "The lowest first-step error is that of", "No floor can be given at the first action",
     ):  # fmt: skip
         assert words in text
     assert "left out" not in text
@@ -110,6 +128,38 @@ def test_a_narrow_console_gets_fewer_columns_not_broken_ones(table, width):
     assert len(grid) == 4
     assert max(map(len, grid)) <= width
     assert "left out for want of width: trained s" in text
+
+
+def test_verdicts_and_distances_to_floors_stand_beside_the_numbers():
+    demos = make_demos()
+    table = make_table(demos, make_semantics(demos))
+    table["dataset"]["warnings"] = []
+    first, second, still = table["policies"]
+    first["verdict"] = make_verdict(vs_hold_still="better", vs_champion="cannot tell")
+    second["verdict"] = make_verdict(vs_hold_still="worse", vs_hold_still_at_one_second="worse")
+    second["at_one_second_mae"] = 8.0
+    still["above_floor"] = [make_gap(interval=[-0.8, 0.5])]
+    champion = make_comparison("mlp_k01/state", "mlp_k04/state", "cannot tell", words="needs more")
+    table["comparisons"].append(champion)
+    lines = drawn(table, 200).splitlines()
+    rows = {
+        name: next(line for line in lines if line.strip().startswith(name))
+        for name in ("mlp_k01", "mlp_k04", "hold_still")
+    }
+    assert "4.44     ✓ better   ? cannot tell" in rows["mlp_k01"]
+    assert "1.62 1.25–2.00" in rows["mlp_k01"]
+    assert "✗ worse        champion" in rows["mlp_k04"]
+    assert "8.000 ✗" in rows["mlp_k04"]
+    assert "at the floor ±0.800" in rows["hold_still"]
+    assert "It cannot be told from the second, mlp_k04: needs more." in lines
+
+
+def test_names_are_never_markup_in_a_sentence():
+    demos = make_demos()
+    table = make_table(demos, make_semantics(demos))
+    table["dataset"]["warnings"] = []
+    table["policies"][0]["observations"] = "[red]x[/red]"
+    assert "seeing [red]x[/red]: 4.50 px" in drawn(table, 200)
 
 
 def test_parts_that_other_commands_show():

@@ -28,10 +28,12 @@ def learning_curve(
     """
     sizes = [point.episodes for point in points]
     means = [_row(point) for point in points]
+    most = max(len(point.orders) for point in points)
     lines = [
         {"episodes": point.episodes, "error": number(error), "order": order}
         for point in points
-        for order, error in enumerate(point.orders)
+        # The full size has one order, in which all lines end.
+        for order, error in enumerate(point.orders if len(point.orders) > 1 else point.orders * most)
     ]
     room = (sizes[-1] / sizes[0]) ** 0.05
     across = alt.Scale(type="log", base=2, domain=[number(sizes[0] / room), number(sizes[-1] * room)], nice=False)

@@ -8,6 +8,16 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from pipeline.sinks.findings import (
+    NOT_HELD,
+    capital,
+    families_words,
+    family,
+    first_step_gap,
+    not_held,
+    without_floor,
+)
+from pipeline.sinks.palette import is_baseline
 from pipeline.sinks.words import common_unit, is_number, plural, show
 
 Table = Mapping[str, Any]
@@ -61,13 +71,37 @@ def notes(table: Table) -> list[str]:
         )
     if not any(row["rollouts"] for row in table["policies"]):
         found.append("Closed loop: no simulator for this data set.")
-    found.append(
-        "This page tests no differences between policies; overlapping intervals mean that the order may be chance."
-    )
+    found += _tested(table)
+    if not_held(table):
+        found.append(f"{capital(NOT_HELD)}.")
     radius = table["floor"].get("radius")
     if radius and is_number(radius["mean"]):
         found.append(_floor_words(radius))
     return found
+
+
+def _tested(table: Table) -> list[str]:
+    """What the words in the table rest on, and what is not tested at all."""
+    said = []
+    if any(row["verdict"]["vs_hold_still"] for row in table["policies"]):
+        said.append(
+            f"The words under a number are tests against hold-still at the same horizon: {families_words(table)} The order "
+            f"of the other rows is not tested here; demobench compare {table['dataset']['name']} tests all pairs."
+        )
+    else:
+        said.append("No difference between policies is tested here; where intervals overlap the order may be chance.")
+    if not any(first_step_gap(row) for row in table["policies"]):
+        return said
+    absent = [name for name in without_floor(table) if any(row["observations"] == name for row in table["policies"])]
+    if absent:
+        said.append(
+            f"“Above floor” is empty where no floor could be given (seeing {', '.join(absent)}): the reasons are below."
+        )
+    more = [row["policy"] for row in table["policies"] if row["observations"] not in absent and not first_step_gap(row)]
+    if more := [name for name in dict.fromkeys(more) if is_baseline(name)]:
+        sees = "sees" if len(more) == 1 else "see"
+        said.append(f"“Above floor” is empty for {' and '.join(more)}, which {sees} more than the set beside the name.")
+    return said
 
 
 def _floor_words(radius: Mapping[str, Any]) -> str:
@@ -98,10 +132,7 @@ def _strict(table: Table, history: int) -> dict[str, str]:
             "anchors of an episode, over held-out episodes (each counts once) and over seeds. Angles are compared "
             "around the circle."
         ),
-        "95 % interval": (
-            "A t interval over held-out episodes, for these seeds and this training set; none below five episodes. "
-            "It says nothing about other training sets. With several folds it is conditional on them."
-        ),
+        "95 % interval": _interval_words(table),
         "RMSE": "The root of the mean over episodes of the squared first-step error, averaged over action columns.",
         "At one second": f"The same error {plural(second, 'step')} ahead; empty where a chunk is shorter.",
         "Whole chunk": WHOLE_CHUNK,
@@ -121,10 +152,59 @@ def _notebook(table: Table, history: int) -> dict[str, str]:
             "|predicted − recorded| of the first action, averaged over action columns, over held-out windows and "
             "over seeds."
         ),
-        "95 % interval": "A t interval over held-out episodes of the mean over windows; none below five episodes.",
+        "95 % interval": f"{_interval_words(table)} Here an episode counts by its windows.",
         "RMSE": "The root of the mean squared first-step error, averaged over action columns.",
         "At one second": f"The same error {plural(second, 'step')} ahead; empty where a chunk is shorter.",
         "Whole chunk": WHOLE_CHUNK,
+    }
+
+
+def _interval_words(table: Table) -> str:
+    folds = len(table["split"]["folds"])
+    given = f"these {folds} folds" if folds > 1 else "this training set"
+    return (
+        "Bootstrap-t: whole held-out episodes are drawn again and again, so that frames of one episode do not pass for "
+        f"independent ones. From 5 to 7 episodes a t interval, below 5 none. What training seeds differ by is joined to it. "
+        f"It holds for {given}; how much other training data would move the number is not in it."
+    )
+
+
+def _verdict_words(table: Table) -> str:
+    together = (
+        f"the {plural(number, 'comparison')} of this page" if (number := family(table)) > 1 else "all comparisons"
+    )
+    return (
+        "Both policies are asked at the same held-out frames. The difference must stand out in two tests: turning the sign "
+        "of each episode's difference at random, and a t test over episodes and training seeds; the larger p counts. Holm's "
+        f"correction over {together} keeps the chance of even one false verdict at 5 % at most. “Cannot tell” comes with "
+        "what would be needed; below five held-out episodes nothing is tested."
+    )
+
+
+def _floors(table: Table) -> dict[str, str]:
+    """What floors are made of, assume, and when they are refused."""
+    from pipeline.statistics.floors import CURVED, FEWEST_EPISODES, MOST_REMOVED, NEAREST
+
+    refused = (
+        f"Refused where extrapolation would take away more than {100 * MOST_REMOVED:.0f} %, and below {FEWEST_EPISODES} "
+        "episodes."
+    )
+    return {
+        "Floor in RMSE (gamma)": (
+            f"For each held-out state the nearest frame of each of the {NEAREST} nearest other episodes. Half the mean "
+            "squared difference of the actions, extrapolated to states that do not differ (Evans & Jones 2002). It assumes "
+            "that the mean action changes smoothly with what is seen; where a jump, as of a gripper that closes, could be "
+            f"{100 * CURVED:.0f} % of the estimate, it is refused. {refused}"
+        ),
+        "Floor in MAE and L2 (pair distance)": (
+            "How far the actions of two people in the same place are apart, extrapolated likewise. The floor lies between "
+            f"half of that and all of it, whatever the distribution; no single number is claimed. {refused}"
+        ),
+        "Best policy, above floor": (
+            "The best policy is chosen on other held-out episodes than those whose error is shown, so choosing does not "
+            "flatter it. An episode moves the error and the floor together: the interval of what lies between is over "
+            "episodes of both at once. A policy significantly below a floor refutes it, and the floor is then withdrawn."
+        ),
     }
 
 
@@ -136,6 +216,10 @@ def _common(table: Table) -> dict[str, str]:
         ),
         "Scaled": "Error over the training actions' standard deviation, averaged over columns that move.",
     }
+    if table["comparisons"]:
+        entries["Better, worse, cannot tell"] = _verdict_words(table)
+    if table["brackets"]:
+        entries |= _floors(table)
     trials = max((row["rollouts"]["n"] for row in table["policies"] if row["rollouts"]), default=0)
     if trials:
         entries["Success and score"] = (

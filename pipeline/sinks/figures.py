@@ -6,13 +6,14 @@ What belongs here: choosing episodes, policies and columns to draw, and saying w
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import altair as alt
 import numpy as np
 
 from pipeline.methods import METHODS
-from pipeline.sinks import charts, planes
+from pipeline.sinks import bracket_chart, charts, planes
+from pipeline.sinks.findings import LOSSES, ahead, bracket_of, capital, floors_of, name_in, not_above, why_not
 from pipeline.sinks.words import common_unit, show
 from pipeline.types import ACTION, STATE, Demonstrations, Predictions, RadiusFloor, Rollouts, Semantics
 
@@ -33,11 +34,12 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """Pictures that answer one question, and how to read them."""
+    """Pictures that answer one question, and how to read them; those about floors stand beside the floors' table."""
 
     question: str
     reading: str
     panels: tuple[Panel, ...]
+    about: Literal["policies", "floors"] = "policies"
 
 
 def benchmark_figures(
@@ -54,8 +56,8 @@ def benchmark_figures(
         table: one object of `run --json`.
         predictions: at held-out anchors; figures of single predictions are left out where there are none.
     """
-    everyone = [row["policy"] for row in table["policies"]]
-    figures = [horizon_figure(table), chunk_figure(table)]
+    everyone = _everyone(table)
+    figures = [bracket_figure(table), horizon_figure(table), chunk_figure(table)]
     best = best_predictions(table, predictions)
     if best is not None:
         in_plane = _in_a_plane(semantics, demos)
@@ -97,9 +99,55 @@ def _longest(predictions: Sequence[Predictions], best: Predictions) -> Predictio
     return max([p for p in same if p.actions.shape[2] <= 16] or [best], key=lambda p: p.actions.shape[2])
 
 
+def bracket_figure(table: Mapping[str, Any]) -> Figure | None:
+    """Floors and the best policy under each, a panel a horizon; None where nothing was held against a floor."""
+    panels = []
+    for horizon in dict.fromkeys(bracket["horizon"] for bracket in table["brackets"]):
+        floors = [f for f in floors_of(table) if f["horizon"] == horizon and f["loss"] != "l2"]
+        lines = [_line(table, floor) for loss in LOSSES for floor in floors if floor["loss"] == loss]
+        lines = [line for line in lines if line["error"] is not None]
+        if lines:
+            look = {"unit": common_unit(table["dataset"]["action_units"]), "everyone": _everyone(table)}
+            caption = capital(ahead(horizon, table["dataset"]["fps"]))
+            panels.append(Panel(caption, bracket_chart.brackets(lines, **look)))
+    if not panels:
+        return None
+    reading = (
+        "The dot is the best policy that sees no more than the line's observation set; the floor cannot be above it. A dark "
+        "tick is the floor, the line through it its 95 % interval. In absolute error (MAE) the floor is only known to lie "
+        "within the grey bar; the line is the bar's 95 % interval. A dotted line with an arrow: no floor could be given; it "
+        "may lie anywhere along the line."
+    )
+    return Figure("Between the floor and the best policy", reading, tuple(panels), "floors")
+
+
+def _everyone(table: Mapping[str, Any]) -> list[str]:
+    return [row["policy"] for row in table["policies"]]
+
+
+def _line(table: Mapping[str, Any], floor: Mapping[str, Any]) -> dict[str, Any]:
+    """What is drawn of one floor and its bracket."""
+    bracket = bracket_of(table, floor) or {"upper": None, "upper_policy": "", "lower": None}
+    refused = why_not(floor, bracket if bracket["upper_policy"] else None) is not None
+    limit = not_above(floor, bracket) if refused else None
+    low, high = (None, None) if refused else (floor["interval"] or (None, None))
+    return {
+        "label": f"{floor['observations']} · {LOSSES[floor['loss']]}",
+        "floor": None if refused else floor["value"], "upper": None if refused else floor["upper"], "low": low,
+        "high": high, "limit": limit and limit[0], "error": bracket["upper"],
+        "policy": bracket["upper_policy"].split("/")[0], "name": _short_name(table, bracket["upper_policy"], floor["observations"]),
+    }  # fmt: skip
+
+
+def _short_name(table: Mapping[str, Any], where: str, observations: str) -> str:
+    """A policy's name; its observation set beside it only where that is another than the line's."""
+    policy, _, own = where.partition("/")
+    return policy if own == observations else name_in(table, where)
+
+
 def horizon_figure(table: Mapping[str, Any]) -> Figure:
     data, unit = table["dataset"], common_unit(table["dataset"]["action_units"])
-    everyone = [row["policy"] for row in table["policies"]]
+    everyone = _everyone(table)
     curves = {}
     for name, rows in by_observation_set(table).items():
         curves[name] = {row["policy"]: row["error_by_horizon"] for row in rows}
@@ -121,7 +169,7 @@ def horizon_figure(table: Mapping[str, Any]) -> Figure:
 
 def chunk_figure(table: Mapping[str, Any]) -> Figure:
     unit = common_unit(table["dataset"]["action_units"])
-    everyone = [row["policy"] for row in table["policies"]]
+    everyone = _everyone(table)
     still = next((row["first_step_mae"] for row in table["policies"] if row["method"] == "hold_still"), None)
     bars = {}
     for name, rows in by_observation_set(table).items():

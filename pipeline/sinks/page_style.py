@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from pipeline.sinks.markup import Html, json_for_script, script_text
-from pipeline.sinks.palette import CONFIG, FAILURE, GRID, INK, MUTED, Colour, all_colours, policy_colours
+from pipeline.sinks.palette import CONFIG, FAILURE, GRID, INK, MUTED, SUCCESS, Colour, all_colours, policy_colours
 
 PAGE = Colour("#ffffff", "#14171b")
 
@@ -72,6 +72,14 @@ section > p, .short { max-width: 78ch; }
 .facts { margin: 2px 0; color: var(--muted); font-size: 14px; }
 .facts span { display: inline-block; }
 .short { margin: 26px 0 -18px; font-size: 18px; }
+.short p { margin: 0; }
+.short ul { margin: 10px 0 0; padding-left: 20px; font-size: 16px; }
+.short li { margin: 3px 0; }
+.verdict { white-space: nowrap; }
+.verdict.better { color: var(SUCCESS); }
+.verdict.worse { color: var(FAILURE); }
+.words th, .words td { text-align: left; }
+.words .wraps { min-width: 30ch; max-width: 62ch; white-space: normal; }
 
 .scroll { overflow-x: auto; border-block: 1px solid var(--line); }
 .scroll:focus-visible, summary:focus-visible { outline: 2px solid var(--ink); outline-offset: 2px; }
@@ -120,6 +128,8 @@ aside ul { margin: 6px 0; padding-left: 20px; font-size: 15px; overflow-wrap: an
 
 .figures { display: grid; gap: 48px 44px; grid-template-columns: repeat(2, minmax(0, 1fr)); margin-top: 48px; }
 .figures section { margin: 0; }
+.figures.brackets { margin: 22px 0 26px; }
+.figures.brackets h3 { margin: 0 0 4px; }
 .figures .wide { grid-column: 1 / -1; }
 .card > p { margin: 0 0 14px; color: var(--muted); font-size: 15px; }
 .panels { display: grid; gap: 22px 34px; grid-template-columns: repeat(auto-fit, minmax(min(100%, 420px), 1fr)); }
@@ -165,6 +175,16 @@ code { font: 14px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu San
   .left { display: none; }
   tbody th.name small { display: block; }
   .range { width: 104px; }
+  .words { margin-inline: 0; }
+  .words thead { display: none; }
+  .words table, .words caption, .words tbody { display: block; }
+  .words tr {
+    display: grid; gap: 6px 12px; grid-template-columns: minmax(0, 1.4fr) repeat(2, minmax(0, 1fr)); padding: 10px 0;
+    border-top: 1px solid var(--line);
+  }
+  .words td { padding: 0; border: 0; white-space: normal; overflow-wrap: anywhere; }
+  .words td::before { content: attr(data-head); display: block; color: var(--muted); font-size: 12px; }
+  .words .wraps { grid-column: 1 / -1; min-width: 0; }
 }
 @media print {
   @page { size: A4 landscape; margin: 12mm; }
@@ -179,6 +199,7 @@ code { font: 14px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu San
   th, td { padding: 3px 5px; }
   .range { width: 96px; }
   .card { break-inside: avoid; }
+  details::details-content { display: block; content-visibility: visible; }
 }
 """
 
@@ -211,7 +232,8 @@ for (const place of document.querySelectorAll("[data-chart]")) {
 def style_sheet(policies: Iterable[str]) -> Html:
     """The page's whole style: looks, the variables for light, dark and paper, and a rule for each policy's colour."""
     rules = STYLE
-    for name, colour in {"INK": INK, "MUTED": MUTED, "GRID": GRID, "PAGE": PAGE, "FAILURE": FAILURE}.items():
+    named = {"INK": INK, "MUTED": MUTED, "GRID": GRID, "PAGE": PAGE, "SUCCESS": SUCCESS, "FAILURE": FAILURE}
+    for name, colour in named.items():
         rules = rules.replace(f"var({name})", f"var({variable(colour)})")
     return Html("\n".join([rules, *_colour_rules(policies)]))
 

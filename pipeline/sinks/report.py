@@ -15,12 +15,13 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.methods import METHODS
 from pipeline.sinks import explanations, replacing
+from pipeline.sinks.findings import Strong, answer
 from pipeline.sinks.markup import Html, element, join, json_for_script, script_text
 from pipeline.sinks.page_style import draw_script, style_sheet, themed
+from pipeline.sinks.report_sections import comparison_section, floor_section, sensor_section
 from pipeline.sinks.report_table import benchmark_table, column_table
-from pipeline.sinks.words import common_unit, plural, show, show_interval
+from pipeline.sinks.words import plural
 
 if TYPE_CHECKING:
     from pipeline.sinks.figures import Figure
@@ -80,7 +81,7 @@ def render_report(table: Table, figures: Sequence["Figure"], provenance: Provena
         element("script", bundle),
         element("script", draw),
     ]
-    body = element("body", element("main", _body(table, _figures(figures, specs), provenance)), scripts)
+    body = element("body", element("main", _body(table, _sections(figures, specs), provenance)), scripts)
     return f"<!doctype html>\n{element('html', element('head', head), body, lang='en')}\n"
 
 
@@ -101,7 +102,7 @@ def _policy(*scripts: str) -> str:
     )
 
 
-def _body(table: Table, figures: Html, provenance: Provenance) -> list[Html | None]:
+def _body(table: Table, sections: Mapping[str, list[Html]], provenance: Provenance) -> list[Html | None]:
     return [
         element(
             "header", element("p", "demobench", class_="brand"), element("h1", table["dataset"]["name"]), _facts(table)
@@ -110,7 +111,10 @@ def _body(table: Table, figures: Html, provenance: Provenance) -> list[Html | No
         element("section", benchmark_table(table), _notes(table), column_table(table)),
         _warnings(provenance.warnings),
         element("noscript", element("p", "The pictures below need JavaScript; nothing is loaded from anywhere.")),
-        figures,
+        floor_section(table, sections["floors"]),
+        sensor_section(table),
+        comparison_section(table),
+        element("div", sections["policies"], class_="figures"),
         element(
             "section",
             element("h2", "How each number was made"),
@@ -131,42 +135,16 @@ def _dotted(parts: Sequence[str]) -> list[Html]:
 
 
 def _in_short(table: Table) -> Html | None:
-    """The answer in a sentence or two, before the table."""
-    rows = [row for row in table["policies"] if row["first_step_mae"] is not None]
-    driven = [row for row in table["policies"] if row["rollouts"]]
-    if not rows:
+    """The answer before the table: one sentence large, what else is known below it."""
+    first, *others = [[_part(part) for part in sentence] for sentence in answer(table)] or [None]
+    if first is None:
         return None
-    unit = common_unit(table["dataset"]["action_units"]) or ""
-    return element("p", _best_offline(rows, unit), _best_driven(driven) if driven else None, class_="short")
+    more = element("ul", [element("li", sentence) for sentence in others]) if others else None
+    return element("div", element("p", first), more, class_="short")
 
 
-def _best_offline(rows: Sequence[Mapping[str, Any]], unit: str) -> Html:
-    best = min(rows, key=lambda row: row["first_step_mae"])
-    interval = show_interval((best.get("interval") or {}).get("first_step_mae"))
-    ratio = best["vs_hold_still"]
-    value = element("b", f"{show(best['first_step_mae'])} {unit}".strip())
-    than_still = f", {show(ratio)} × smaller than holding still" if ratio is not None and ratio > 1 else ""
-    return join(
-        "The lowest first-step error is that of ", _who(best), ": ", value, f" {interval}".rstrip(), than_still, ". "
-    )
-
-
-def _best_driven(rows: Sequence[Mapping[str, Any]]) -> Html:
-    most = max(rows, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]))
-    n, rate, interval = most["rollouts"]["n"], most["rollouts"]["success"], most["rollouts"].get("success_interval")
-    if rate == 0:
-        score = element("b", show(most["rollouts"]["score"]))
-        none = f"In closed loop no policy succeeds from any of {n} start states; the highest score is that of "
-        return join(none, _who(most), ": ", score, ".")
-    count = element("b", f"{round(rate * n)} of {n}")
-    percent = f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f} %)" if show_interval(interval) else ""
-    return join("In closed loop ", _who(most), " succeeds most often: ", count, percent, ".")
-
-
-def _who(row: Mapping[str, Any]) -> Html:
-    """A policy, and what it sees if its answer depends on that."""
-    sees = row["method"] not in METHODS or METHODS[row["method"]].uses_observations
-    return join(element("b", row["policy"]), f" seeing {row['observations']}" if sees else None)
+def _part(part: str) -> Html | str:
+    return element("b", part) if isinstance(part, Strong) else part
 
 
 def _notes(table: Table) -> Html:
@@ -180,23 +158,29 @@ def _warnings(warnings: Sequence[str]) -> Html | None:
     return element("aside", element("h2", f"About the data: {plural(len(warnings), 'warning')}"), element("ul", items))
 
 
-def _figures(figures: Sequence["Figure"], specs: Sequence[Mapping[str, Any]]) -> Html:
-    """Figures with places for their charts, numbered through the page as the script finds them; small ones in pairs."""
-    sections, place = [], 0
+def _sections(figures: Sequence["Figure"], specs: Sequence[Mapping[str, Any]]) -> dict[str, list[Html]]:
+    """Figures with places for their charts, numbered through the page, by what they are about."""
+    sections: dict[str, list[Html]] = {"floors": [], "policies": []}
+    place = 0
     for figure in figures:
-        panels = []
-        for panel in figure.panels:
-            is_square = bool(specs[place].get("usermeta", {}).get("square"))
-            label = f"{figure.question} {panel.caption}".strip()
-            slot = element("div", class_="chart", data_chart=place, role="img", aria_label=label)
-            caption = element("figcaption", panel.caption) if panel.caption else None
-            panels.append(element("figure", caption, slot, class_="square" if is_square else None))
-            place += 1
-        is_wide = len(panels) > (2 if is_square else 1)
-        head = [element("h2", figure.question), element("p", figure.reading)]
-        body = element("div", panels, class_="panels")
-        sections.append(element("section", head, body, class_="card wide" if is_wide else "card"))
-    return element("div", sections, class_="figures")
+        sections[figure.about].append(_figure(figure, place, specs))
+        place += len(figure.panels)
+    return sections
+
+
+def _figure(figure: "Figure", place: int, specs: Sequence[Mapping[str, Any]]) -> Html:
+    """One question with its charts, the first at `place` among all; small ones in pairs."""
+    panels = []
+    for number, panel in enumerate(figure.panels, place):
+        is_square = bool(specs[number].get("usermeta", {}).get("square"))
+        label = f"{figure.question} {panel.caption}".strip()
+        slot = element("div", class_="chart", data_chart=number, role="img", aria_label=label)
+        caption = element("figcaption", panel.caption) if panel.caption else None
+        panels.append(element("figure", caption, slot, class_="square" if is_square else None))
+    is_wide = len(panels) > (2 if is_square else 1)
+    head = [element("h2" if figure.about == "policies" else "h3", figure.question), element("p", figure.reading)]
+    body = element("div", panels, class_="panels")
+    return element("section", head, body, class_="card wide" if is_wide else "card")
 
 
 def _definitions(entries: Mapping[str, str]) -> Html:

@@ -8,8 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from pipeline.sinks.findings import MARKS, address, champion, first_step_gap, gap_parts
 from pipeline.sinks.markup import Html, element, join
 from pipeline.sinks.palette import is_baseline
+from pipeline.sinks.report_sections import verdict
 from pipeline.sinks.words import DASH, common_unit, decimals_for, is_number, show, show_interval
 
 Row = Mapping[str, Any]
@@ -17,7 +19,7 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Column:
-    """A column of numbers: its heading, what stands below it, a row's value, and which end is better, if either."""
+    """A column: its heading, what stands below it, a row's value (a number, or a word), and which end is better, if either."""
 
     title: str
     below: str
@@ -65,10 +67,18 @@ def _columns(table: Mapping[str, Any]) -> list[Column]:
             "First-step MAE", _and(unit, "95 % interval"), lambda row: row["first_step_mae"], "low",
             lambda row, shown: _with_interval(row, shown, scale),
         ),
+        Column(
+            "× hold-still", "ratio, tested", lambda row: row["vs_hold_still"], "high",
+            lambda row, shown: _with_verdict(shown, row["verdict"]["vs_hold_still"]), 2,
+        ),
+        *_champion(table),
         Column("RMSE", unit, lambda row: row["first_step_rmse"], "low"),
-        Column("At 1 s", _and("MAE", unit), lambda row: row["at_one_second_mae"], "low"),
+        *_floor(table, unit),
+        Column(
+            "At 1 s", _and("MAE", unit), lambda row: row["at_one_second_mae"], "low",
+            lambda row, shown: _with_verdict(shown, row["verdict"]["vs_hold_still_at_one_second"]),
+        ),
         Column("Whole chunk", _and("MAE", unit), lambda row: row["whole_chunk_mae"]),
-        Column("× hold-still", "ratio", lambda row: row["vs_hold_still"], "high", None, 2),
         Column("Scaled", "deviations", lambda row: row["scaled"], "low"),
     ]  # fmt: skip
     if any(row["rollouts"] for row in table["policies"]):
@@ -84,6 +94,38 @@ def _columns(table: Mapping[str, Any]) -> list[Column]:
     ]
 
 
+def _champion(table: Mapping[str, Any]) -> list[Column]:
+    """Verdicts against the champion, where one was named."""
+    named = champion(table)
+    if named is None:
+        return []
+
+    def word(row: Row) -> str | None:
+        return "champion" if address(row) == named else row["verdict"]["vs_champion"]
+
+    return [Column("Against", "the champion", word, None, lambda _, said: verdict(said) if said in MARKS else said, 0)]
+
+
+def _floor(table: Mapping[str, Any], unit: str) -> list[Column]:
+    """How far each row is above the floor of what it sees, where any is."""
+    if not any(first_step_gap(row) for row in table["policies"]):
+        return []
+
+    def gap(row: Row) -> float | None:
+        return (first_step_gap(row) or {}).get("gap")
+
+    return [Column("Above floor", _and("RMSE", unit), gap, None, _above_floor)]
+
+
+def _with_verdict(shown: str, word: str | None) -> Html | str:
+    return shown if word is None else join(shown, element("small", verdict(word)))
+
+
+def _above_floor(row: Row, _: str) -> Html:
+    short, beside = gap_parts(first_step_gap(row))
+    return join(short, element("small", beside) if beside else None)
+
+
 def _and(*words: str) -> str:
     return ", ".join(word for word in words if word)
 
@@ -93,19 +135,22 @@ def _head(title: str, below: str, class_: str | None = None) -> Html:
 
 
 def _best(column: Column, rows: Sequence[Row]) -> Any:
+    if column.better is None:
+        return None
     values = [value for row in rows if is_number(value := column.value(row))]
-    if column.better is None or len(set(values)) < 2:
+    if len(set(values)) < 2:
         return None
     return min(values) if column.better == "low" else max(values)
 
 
 def _cell(column: Column, row: Row, decimals: int, best: Any) -> Html:
     value = column.value(row)
-    shown = show(value, decimals)
-    content = column.cell(row, shown) if column.cell and is_number(value) else shown
+    applies = isinstance(value, str) or is_number(value)
+    shown = value if isinstance(value, str) else show(value, decimals)
+    content = column.cell(row, shown) if column.cell and applies else shown
     if best is not None and value == best:
         return element("td", content, class_="best")
-    return element("td", content, class_=None if is_number(value) else "none")
+    return element("td", content, class_=None if applies else "none")
 
 
 def _of(row: Row, key: str) -> float | None:

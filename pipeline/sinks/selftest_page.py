@@ -21,7 +21,7 @@ from pipeline.statistics.known_truth.shards import Cell, code_hash
 
 HEAD = """# Are the statistics right? The known-truth suite
 
-Made by `demobench selftest --{size} --page`, never by hand: {shards} minutes of one core, code {code}.
+Made by `demobench selftest{full} --page docs/known_truth.md`, never by hand: {minutes} minutes of one core, code {code}.
 
 Demonstrations are drawn whose floors are known exactly, errors whose means are known, and pairs of results that differ by
 nothing but chance. Every estimator, interval and verdict of this project is held against them. A number here comes with its
@@ -35,7 +35,9 @@ def write_page(page: Path, results: Sequence[Result], cells: Sequence[Cell], *, 
     """Write the page and, in `images` beside it, a plot for each section that has something to show."""
     images = page.parent / "images"
     images.mkdir(parents=True, exist_ok=True)
-    text = HEAD.format(size=size, shards=f"{core_minutes:.0f}", code=code_hash()[:12], sure=goals.SURE)
+    text = HEAD.format(
+        full=" --full" if size == "full" else "", minutes=f"{core_minutes:.0f}", code=code_hash()[:12], sure=goals.SURE
+    )
     text += _goal_table(results) + _beyond(results)
     for title, name, words, chart in _plots(results, cells):
         if chart is not None:

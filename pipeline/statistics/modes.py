@@ -528,10 +528,11 @@ def _words(name: str, horizon: int, stands_out: Sequence[bool], gain: float, sha
             "state more likely than one Gaussian on held-out episodes, and has more than one peak there."
         )
     why = (
-        "a mixture is no more likely than one Gaussian on held-out episodes",
+        "a mixture is not clearly more likely than one Gaussian on held-out episodes",
         f"a mixture is more likely than one Gaussian ({gain:.2f} nats a state), but has more than one peak in hardly any state",
-        f"a mixture is more likely than one Gaussian ({gain:.2f} nats a state), but held-out actions do not avoid the dips of "
-        "its density: skewed, correlated or flat noise rather than modes",
-        "where a mixture has two peaks, neighbouring states agree on one of them: a jump in what people did rather than modes",
+        f"a mixture is more likely than one Gaussian ({gain:.2f} nats a state), but held-out actions do not clearly avoid the "
+        "dips of its density, so that skewed, correlated or flat noise would explain it",
+        "where a mixture has two peaks, neighbouring states agree too often on one of them, so that a jump in what people did "
+        "would explain it",
     )
     return f"{at} there is no evidence of several modes: {why[list(stands_out).index(False)]}."

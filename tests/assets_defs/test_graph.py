@@ -39,8 +39,14 @@ def test_the_table_has_every_policy_and_honest_numbers(finished):
         "hold_still", "mean_action", "constant_velocity", "nearest_neighbour", "mlp_k01", "mlp_k04",
     }  # fmt: skip
     assert table["dataset"]["episodes"] == 6
-    assert table["brackets"] == []
-    assert rows["mlp_k04"]["verdict"] == {"vs_hold_still": None, "vs_champion": None}
+    assert len(table["brackets"]) == 6  # two horizons, three losses
+    assert all("6 episodes are too few" in bracket["words"] for bracket in table["brackets"])
+    assert {c["word"] for c in table["comparisons"]} <= {"better", "worse", "cannot tell"}
+    assert rows["hold_still"]["verdict"]["vs_hold_still"] is None
+    assert rows["mlp_k01"]["verdict"]["vs_hold_still"] == "cannot tell"  # six episodes cannot tell so many apart
+    assert set(rows["mlp_k04"]["verdict"]) == {
+        "vs_hold_still", "vs_champion", "vs_hold_still_at_one_second", "vs_champion_at_one_second",
+    }  # fmt: skip
     assert rows["hold_still"]["vs_hold_still"] == pytest.approx(1.0)
     assert rows["mlp_k04"]["chunk"] == 4
     assert rows["hold_still"]["chunk"] is None

@@ -86,15 +86,65 @@ def make_row(policy: str, method: str, demos: Demonstrations, *, error: float = 
         "hold_still_by_horizon": list(20 + 3.0 * np.arange(11)),
         "error_by_joint": {name: error + i for i, name in enumerate(names)}, "vs_hold_still": 20 / error,
         "scaled": error / 100, "scaled_by_joint": dict.fromkeys(names, error / 100),
-        "ensembled_first_step_mae": None, "interval": {"first_step_mae": [0.9 * error, 1.1 * error]}, "params": 0,
-        "train_s": 0.0, "latency_ms": 0.12, "verdict": {"vs_hold_still": None, "vs_champion": None}, "rollouts": None,
+        "ensembled_first_step_mae": None, "interval": {"first_step_mae": [0.9 * error, 1.1 * error]},
+        "interval_method": "bootstrap-t", "params": 0, "train_s": 0.0, "latency_ms": 0.12, "verdict": make_verdict(),
+        "above_floor": [], "rollouts": None,
     } | more  # fmt: skip
 
 
+def make_verdict(**words: str) -> dict:
+    keys = ("vs_hold_still", "vs_champion", "vs_hold_still_at_one_second", "vs_champion_at_one_second")
+    return dict.fromkeys(keys) | words
+
+
+def make_comparison(a: str, b: str, word: str = "better", **more) -> dict:
+    """A comparison of `run --json`; its numbers are made up."""
+    tested = word != "not comparable"
+    numbers = {"difference": -15.5, "interval": [-17.0, -14.0], "p": 0.001, "p_holm": 0.002, "smallest_seen": 1.5}
+    numbers = numbers if tested else dict.fromkeys(numbers)
+    named = {"a": a, "b": b, "metric": "first_step_mae", "word": word}
+    return named | numbers | {"needs_episodes": None, "words": "error 78 % lower"} | more
+
+
+def make_floor(loss: str = "rmse", **more) -> dict:
+    """A floor of `run --json`: one number in squared error, a span in absolute error."""
+    numbers = {"value": 4.0, "upper": None, "interval": [3.6, 4.4]}
+    if loss != "rmse":
+        numbers = {"value": 2.5, "upper": 5.0, "interval": [2.25, 5.5]}
+    said = {"observations": "state", "history": 3, "horizon": 0, "loss": loss, "below": None, "refused": None}
+    return said | {"estimator": "gamma" if loss == "rmse" else "pair_distance", "nearest": 0.1} | numbers | more
+
+
+def make_refusal(loss: str = "rmse", **more) -> dict:
+    """A floor that could not be given."""
+    nothing = {"value": None, "upper": None, "interval": None, "below": 30.0, "refused": "the states differ: too much"}
+    return make_floor(loss, **(nothing | more))
+
+
+def make_bracket(loss: str = "rmse", **more) -> dict:
+    named = {"observations": "state", "horizon": 0, "loss": loss, "upper_policy": "mlp_k01/state"}
+    found = {"lower": 4.0, "upper": 5.625, "gap": 1.625, "interval": [1.25, 2.0], "words": "not shown"}
+    return named | (found if loss == "rmse" else found | {"lower": 2.5, "upper": 4.5}) | more
+
+
+def make_sensor(**more) -> dict:
+    """What seeing `pose` beside `state` is worth."""
+    named = {"smaller": "state", "larger": "pose", "horizon": 0, "loss": "rmse"}
+    found = {"value": 1.5, "interval": [1.0, 2.0], "at_least": None, "words": "1.5 [1, 2], 38 % of the floor"}
+    return named | found | more
+
+
+def make_gap(**more) -> dict:
+    """How far a row is above its floor."""
+    found = {"error": 5.625, "gap": 1.625, "interval": [1.25, 2.0], "words": "not shown"}
+    return {"horizon": 0, "loss": "rmse", "floor": 4.0} | found | more
+
+
 def make_table(demos: Demonstrations, semantics: Semantics) -> dict:
-    """One object of `run --json`, with two chunk sizes and hold-still."""
+    """One object of `run --json`: two chunk sizes, better than hold-still and above a floor."""
     action = demos.features[ACTION]
     rolled = {"n": 50, "success": 0.82, "success_interval": [0.69, 0.91], "score": 0.934}
+    better = {"verdict": make_verdict(vs_hold_still="better")}
     trained = {"params": 275462, "train_s": 12.3}
     return {
         "dataset": {
@@ -111,12 +161,14 @@ def make_table(demos: Demonstrations, semantics: Semantics) -> dict:
                 "probes": 12, "median_neighbours": 5.0, "mean": 6.25, "p90": 11.5, "observations": "state",
                 "radius": 2.0, "scaled": False, "unit": "px",
             },
-            "estimates": [],
+            "estimates": [make_floor("rmse"), make_floor("mae")],
         },
-        "brackets": [],
+        "brackets": [make_bracket("rmse"), make_bracket("mae")],
+        "sensors": [],
+        "comparisons": [make_comparison(f"{name}/state", "hold_still/state") for name in ("mlp_k01", "mlp_k04")],
         "policies": [
-            make_row("mlp_k01", "mlp", demos, error=4.5, chunk=1, **trained),
-            make_row("mlp_k04", "mlp", demos, error=5.5, chunk=4, rollouts=rolled, **trained),
+            make_row("mlp_k01", "mlp", demos, error=4.5, chunk=1, above_floor=[make_gap()], **better, **trained),
+            make_row("mlp_k04", "mlp", demos, error=5.5, chunk=4, rollouts=rolled, **better, **trained),
             make_row("hold_still", "hold_still", demos, error=20.0),
         ],
         "artifacts": {"report": None, "mcap": "out/held out.mcap", "rerun": "out/held_out.rrd", "mlflow": None},

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.sinks import charts, planes
+from pipeline.sinks import bracket_chart, charts, planes
 from pipeline.sinks.drawing import chart_png, equal_domains, number, with_unit
 from pipeline.sinks.palette import policy_colours
 
@@ -25,7 +25,11 @@ def all_charts(demos) -> dict:
     rows = [make_row("mlp_k01", "mlp", demos, chunk=1), make_row("mlp_k16", "mlp", demos, chunk=16, interval={})]
     curves = {"mlp_k16": [1.0, NAN, 3.0], "hold_still": [2.0, 4.0, 8.0], "mean_action": [90.0, None]}
     series = {"state": wave, "recorded": wave + 1, "mlp_k16": np.where(wave > 0, wave, np.nan)}
+    known = {"floor": 4.0, "upper": None, "low": 3.0, "high": 5.0, "limit": None, "error": 6.0, "policy": "mlp_k16"}
+    span, refused = known | {"upper": 7.0}, known | {"floor": None, "low": None, "high": None, "limit": 5.0}
+    lines = [line | {"label": f"{NAMES[1]} {i}", "name": NAMES[0]} for i, line in enumerate((known, span, refused))]
     return {
+        "brackets": bracket_chart.brackets(lines, unit="px"),
         "horizon": charts.error_over_horizon(curves, fps=10, unit="px"),
         "bars": charts.chunk_bars(rows, unit=None, hold_still=9.0),
         "time": charts.columns_over_time(np.arange(30) / 10, series, unit="rad", name=NAMES[0]),
@@ -38,7 +42,7 @@ def all_charts(demos) -> dict:
     }
 
 
-CHARTS = ("horizon", "bars", "time", "lag", "loss", "floor", "scatter", "paths", "rollouts")
+CHARTS = ("brackets", "horizon", "bars", "time", "lag", "loss", "floor", "scatter", "paths", "rollouts")
 
 
 def rows_of(chart) -> list[dict]:
@@ -97,6 +101,18 @@ def test_bars_keep_their_order_and_name_the_observation_set_only_where_a_policy_
     assert [row["label"] for row in bars] == ["mlp_k16 (pose)", "mlp_k16 (state)", "hold_still"]
     assert bars[0]["low"] == 4.5
     assert bars[1]["low"] is None
+
+
+def test_a_bracket_is_a_tick_a_span_or_an_open_line(demos):
+    by_mark = {}
+    for layer in all_charts(demos)["brackets"].to_dict()["layer"]:
+        by_mark.setdefault(layer["mark"]["type"], []).append(layer)
+    assert {"bar", "tick", "rule", "point", "text"} == set(by_mark)
+    assert by_mark["bar"][0]["encoding"]["x2"]["field"] == "upper"
+    domain = by_mark["tick"][0]["encoding"]["x"]["scale"]["domain"]
+    assert domain == [0, pytest.approx(7.42)]
+    dashed = next(rule for rule in by_mark["rule"] if "strokeDash" in rule["mark"])
+    assert (dashed["encoding"]["x"]["field"], dashed["encoding"]["x2"]["field"]) == ("start", "limit")
 
 
 def test_lag_leaves_out_columns_that_have_none(demos):

@@ -9,6 +9,7 @@ from pipeline.sinks.figures import (
     COLUMNS,
     benchmark_figures,
     best_predictions,
+    bracket_figure,
     by_observation_set,
     chunk_figure,
     floor_figure,
@@ -17,7 +18,16 @@ from pipeline.sinks.figures import (
     rollout_figure,
 )
 
-from .making import make_demos, make_predictions, make_row, make_semantics, make_table
+from .making import (
+    make_bracket,
+    make_demos,
+    make_floor,
+    make_predictions,
+    make_refusal,
+    make_row,
+    make_semantics,
+    make_table,
+)
 
 
 def questions(figures) -> list[str]:
@@ -31,6 +41,7 @@ def values(chart, field: str) -> list:
 def test_a_benchmark_in_the_plane_has_one_figure_a_question(demos, semantics, table, predictions, floor, rollouts):
     figures = benchmark_figures(table, demos, semantics, predictions, [floor], [rollouts])
     assert questions(figures) == [
+        "Between the floor and the best policy",
         "How fast does the error grow, the further ahead a policy predicts?",
         "What does a longer chunk cost on the very next action?",
         "What would the policy have done in demonstrations that it never saw?",
@@ -39,14 +50,14 @@ def test_a_benchmark_in_the_plane_has_one_figure_a_question(demos, semantics, ta
         "How much do demonstrators disagree in one and the same spot?",
         "How far does the robot lag behind its commands?",
     ]
-    assert [panel.caption for panel in figures[2].panels] == ["Episode 8", "Episode 9"]
+    assert [panel.caption for panel in figures[3].panels] == ["Episode 8", "Episode 9"]
 
 
 def test_joints_over_time_where_actions_are_no_plane():
     demos = make_demos(columns=8, units="deg")
     semantics = make_semantics(demos)
     figures = benchmark_figures(make_table(demos, semantics), demos, semantics, [make_predictions(demos, [1])])
-    joints = figures[2]
+    joints = figures[3]
     assert joints.question == "What would the policy have done in a demonstration that it never saw?"
     assert len(joints.panels) == COLUMNS
     assert joints.reading.endswith("Not shown: joint_6, joint_7.")
@@ -58,11 +69,38 @@ def test_velocities_show_no_state_and_no_lag():
     semantics = replace(make_semantics(demos, "velocity"), tracking_lag=(None,) * 3)
     figures = benchmark_figures(make_table(demos, semantics), demos, semantics, [make_predictions(demos, [1])])
     assert "How far does the robot lag behind its commands?" not in questions(figures)
-    assert set(values(figures[2].panels[0].chart, "what")) == {"recorded", "mlp_k04"}
+    assert set(values(figures[3].panels[0].chart, "what")) == {"recorded", "mlp_k04"}
 
 
 def test_without_predictions_only_figures_from_the_table_are_left(demos, semantics, table):
-    assert len(benchmark_figures(table, demos, semantics, [])) == 3
+    assert len(benchmark_figures(table, demos, semantics, [])) == 4
+
+
+def test_brackets_have_a_panel_a_horizon_and_a_line_a_set_and_loss(table):
+    table["floor"]["estimates"] += [make_floor("l2"), make_refusal(horizon=10)]
+    table["brackets"] += [make_bracket("l2"), make_bracket(horizon=10, lower=None)]
+    figure = bracket_figure(table)
+    assert figure.about == "floors"
+    assert [panel.caption for panel in figure.panels] == ["First action", "One second ahead"]
+    assert set(values(figure.panels[0].chart, "label")) == {"state · RMSE", "state · MAE"}
+    (floor,) = {row for row in zip(values(figure.panels[0].chart, "floor"), values(figure.panels[0].chart, "upper"), strict=True)
+                if row[1] is None}  # fmt: skip
+    assert floor == (4.0, None)
+    assert (
+        values(figure.panels[1].chart, "limit")[0] == 5.625
+    )  # what the policy reaches, as it is below the estimator's 30
+
+
+def test_a_bracket_names_the_best_policys_set_only_where_it_is_another(demos, table):
+    table["policies"].append(make_row("mlp_k01", "mlp", demos, observations="pose"))
+    table["floor"]["estimates"].append(make_floor(observations="pose"))
+    table["brackets"].append(make_bracket(observations="pose"))
+    names = values(bracket_figure(table).panels[0].chart, "name")
+    assert set(names) == {"mlp_k01", "mlp_k01 (state)"}
+
+
+def test_without_brackets_there_is_no_picture_of_them(table):
+    assert bracket_figure(table | {"brackets": []}) is None
 
 
 def test_rows_that_no_observation_set_changes_come_with_every_set(demos, table):
@@ -102,7 +140,7 @@ def test_the_best_policy_is_a_trained_one_with_predictions(table, predictions):
 
 
 def test_moves_are_actions_less_the_state(demos, semantics, table, predictions):
-    figure = benchmark_figures(table, demos, semantics, predictions[:1])[3]
+    figure = benchmark_figures(table, demos, semantics, predictions[:1])[4]
     rows = [row for data in figure.panels[0].chart.to_dict()["datasets"].values() for row in data if len(data) > 2]
     np.testing.assert_allclose([row["y"] - row["x"] for row in rows], 5.0, atol=1e-2)
     assert max(abs(row["x"]) for row in rows) < 40
@@ -140,4 +178,4 @@ def test_lag_has_a_panel_for_each_unit(table):
 @pytest.mark.parametrize("share", [[1], [2], [1, 2]])
 def test_any_share_of_episodes_will_do(demos, semantics, table, share):
     figures = benchmark_figures(table, demos, semantics, [make_predictions(demos, share, "mlp_k01", 1)])
-    assert [panel.caption for panel in figures[2].panels] == [f"Episode {e + 7}" for e in share]
+    assert [panel.caption for panel in figures[3].panels] == [f"Episode {e + 7}" for e in share]

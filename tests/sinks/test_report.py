@@ -17,7 +17,18 @@ from pipeline.sinks.markup import outside_references
 from pipeline.sinks.report import Provenance, render_report, write_report
 from pipeline.types import ACTION
 
-from .making import NASTY, make_demos, make_row, make_semantics, make_table
+from .making import (
+    NASTY,
+    make_bracket,
+    make_comparison,
+    make_demos,
+    make_refusal,
+    make_row,
+    make_semantics,
+    make_sensor,
+    make_table,
+    make_verdict,
+)
 
 PROVENANCE = Provenance("demobench run small --protocol strict", 3, "0.1.0 (1a2b3c4)", "2026-11-23", ("dead column",))
 
@@ -39,10 +50,12 @@ def scripts_of(page: str) -> list[tuple[str, str]]:
 
 def test_the_table_comes_first_and_holds_the_numbers(table, figures):
     page = text_of(render_report(table, figures, PROVENANCE))
-    assert "mlp_k01 state state 4.50 [4.05, 4.95] 5.62 – – 4.44 0.0450 – – 275,462 12 0.120" in page
-    assert "mlp_k04 state state 5.50 [4.95, 6.05] 6.88 – – 3.64 0.0550 41/50 69–91 % 0.934" in page
+    assert (
+        "mlp_k01 state state 4.50 [4.05, 4.95] 4.44 ✓ better 5.62 1.62 [1.25, 2.00] – – 0.0450 – – 275,462 12" in page
+    )
+    assert "mlp_k04 state state 5.50 [4.95, 6.05] 3.64 ✓ better 6.88 – – – 0.0550 41/50 69–91 % 0.934" in page
     assert page.index("275,462") < page.index("How fast does the error grow")
-    heads = "First-step MAE px, 95 % interval RMSE px At 1 s MAE, px Whole chunk MAE, px × hold-still ratio Scaled"
+    heads = "First-step MAE px, 95 % interval × hold-still ratio, tested RMSE px Above floor RMSE, px At 1 s MAE, px"
     assert heads in page
 
 
@@ -59,7 +72,10 @@ def test_budget_protocol_seeds_folds_and_hashes_are_said(table, figures):
 
 def test_the_answer_is_in_a_sentence(table, figures):
     page = text_of(render_report(table, figures, PROVENANCE))
-    assert "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]" in page
+    said = "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]. It is better than hold-still ,"
+    assert f"{said} whose error is 4.44 times as large." in page
+    assert page.index(said) < page.index("× hold-still")
+    assert "It is 1.62 px RMSE above the floor [1.25, 2.00]" in page
     assert "mlp_k04 seeing state succeeds most often: 41 of 50 (69–91 %)." in page
 
 
@@ -67,14 +83,15 @@ def test_the_sentence_names_no_observations_where_they_do_not_matter(table, figu
     table["policies"][-1]["first_step_mae"] = 1.0
     page = text_of(render_report(table, figures, PROVENANCE))
     assert "The lowest first-step error is that of hold_still : 1.00 px" in page
-    assert "smaller than holding still" not in page
+    assert "So no policy is better than holding still." in page
 
 
 def test_what_does_not_apply_is_said_once(demos, semantics, table):
     for row in table["policies"]:
-        row |= {"rollouts": None, "interval": {"first_step_mae": None}}
+        row |= {"rollouts": None, "interval": {"first_step_mae": None}, "verdict": make_verdict(), "above_floor": []}
     table["dataset"] |= {"revision": None, "action_units": [None, None]}
-    table["floor"]["radius"] = None
+    table["floor"] = {"radius": None, "estimates": []}
+    table |= {"brackets": [], "comparisons": []}
     page = text_of(
         render_report(table, benchmark_figures(table, demos, semantics, []), replace(PROVENANCE, warnings=()))
     )
@@ -82,7 +99,8 @@ def test_what_does_not_apply_is_said_once(demos, semantics, table):
     assert "No intervals: they need at least five held-out episodes." in page
     assert "The data set does not state the unit of its actions." in page
     assert "no revision" in page
-    for absent in ("Success", "warning", "Radius floor", "None", "nan"):
+    assert "No difference between policies is tested here" in page
+    for absent in ("Success", "warning", "Radius floor", "None", "nan", "How good can it get", "Which differences"):
         assert absent not in page, absent
 
 
@@ -92,10 +110,19 @@ def test_mixed_units_are_warned_of(table, figures):
 
 
 def test_the_notebook_protocol_is_explained_as_what_it_is(table, figures):
-    table["protocol"] = "notebook"
+    table |= {"protocol": "notebook", "brackets": []}
     page = text_of(render_report(table, figures, PROVENANCE))
     assert "normalisation has seen the held-out episodes" in page
     assert "Means and deviations come from training episodes only." not in page
+    assert "No policy is held against a floor under protocol notebook" in page
+
+
+def test_an_empty_distance_to_the_floor_is_explained(demos, table, figures):
+    table["policies"].append(make_row("act", "act", demos, observations="pose"))
+    table["floor"]["estimates"].append(make_refusal(observations="pose"))
+    page = text_of(render_report(table, figures, PROVENANCE))
+    assert "“Above floor” is empty where no floor could be given (seeing pose): the reasons are below." in page
+    assert "“Above floor” is empty for hold_still, which sees more than the set beside the name." in page
 
 
 def test_errors_of_each_action_column_are_there(table, figures):
@@ -106,7 +133,7 @@ def test_errors_of_each_action_column_are_there(table, figures):
 def test_missing_numbers_are_dashes_and_the_page_is_still_json(table, figures):
     table["policies"][0] |= {"first_step_mae": None, "error_by_horizon": [None], "scaled": None, "latency_ms": None}
     page = render_report(table, figures, PROVENANCE)
-    assert "mlp_k01 state state – 5.62 – – 4.44 – – – 275,462 12 –" in text_of(page)
+    assert "mlp_k01 state state – 4.44 ✓ better 5.62 1.62 [1.25, 2.00] – – – – – 275,462 12 –" in text_of(page)
     json.loads(scripts_of(page)[0][1])
 
 
@@ -118,8 +145,13 @@ def hostile_page() -> str:
     demos = replace(demos, name=f"</title>{NASTY}", features=features)
     semantics = make_semantics(demos)
     table = make_table(demos, semantics)
-    for row in table["policies"]:
-        row["observations"] = f"set'{NASTY}"
+    for named in (*table["policies"], *table["floor"]["estimates"], *table["brackets"]):
+        named["observations"] = f"set'{NASTY}"
+    table["brackets"][0]["upper_policy"] = f"p/{NASTY}"
+    table["floor"]["estimates"] += [make_refusal(horizon=10, observations=NASTY, refused=NASTY)]
+    table["brackets"] += [make_bracket(horizon=10, observations=NASTY, lower=None)]
+    table["sensors"] = [make_sensor(smaller=NASTY, larger=f"{NASTY}&")]
+    table["comparisons"] += [make_comparison(f"x]{NASTY}/a", f"hold_still/{NASTY}", "not comparable", words=NASTY)]
     table["policies"].append(make_row(f"x]{NASTY}", "act", demos, chunk=2, observations=f"set'{NASTY}"))
     provenance = Provenance(f"demobench run '{NASTY}'", 3, NASTY, warnings=(f"<b>{NASTY}",))
     return render_report(table, benchmark_figures(table, demos, semantics, []), provenance)
@@ -160,8 +192,6 @@ def test_a_place_that_cannot_be_written_is_one_clear_message(tmp_path, table):
 
 # In a browser ---------------------------------------------------------------------------------------------------------
 
-DRAWN = "document.querySelectorAll('[data-chart] svg').length === document.querySelectorAll('[data-chart]').length"
-
 
 @pytest.fixture(scope="module")
 def browser():
@@ -185,7 +215,8 @@ def visit(browser, path: Path, **context):
     page.on("console", lambda message: said.append(message.text))
     page.on("pageerror", lambda error: said.append(str(error)))
     page.goto(path.as_uri())
-    page.wait_for_function(DRAWN, timeout=60_000)
+    places = page.locator("[data-chart]").count()  # no function to wait for: the page's own policy forbids `eval`
+    page.locator("[data-chart] svg").nth(places - 1).wait_for(state="attached", timeout=60_000)
     return page, asked, said
 
 
@@ -225,10 +256,14 @@ def test_charts_follow_the_readers_setting(browser, tmp_path, table, figures, sc
 
 
 def test_a_phone_scrolls_the_table_and_nothing_else(browser, tmp_path, table, figures):
+    table["sensors"] = [make_sensor()]
+    table["comparisons"] += [make_comparison("mlp_k04/state", "mlp_k01/state", "cannot tell", words="needs " * 20)]
     write_report(tmp_path / "report.html", table, figures, PROVENANCE)
     page, _, _ = visit(browser, tmp_path / "report.html", viewport={"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     assert page.evaluate("Math.max(...[...document.querySelectorAll('.chart svg')].map(s => s.clientWidth))") <= 358
+    tables = "[...document.querySelectorAll('.words')].map(t => t.scrollWidth - t.clientWidth)"
+    assert page.evaluate(tables) == [0, 0, 0]
     page.close()
 
 

@@ -15,7 +15,7 @@ in the same place is not. The states do not depend on the noise, so the floor at
 and beside them, for the estimator of pair distances, pair_mae and pair_l2: the mean L1 and L2 distance of two actions at
 one and the same state.
 
-Where noise is the same everywhere, mse is a formula, and mae and l2 are had from 5 × 10⁵ draws of it (to 0.1 %).
+Where noise is the same everywhere, mse is a formula, and mae and l2 are had from 3 × 10⁵ draws of it (to 0.2 %).
 Where it depends on the state, the floor at a state is a formula, averaged over 8,000 episodes of states (to 0.3 %),
 episodes weighted equally. Noise tied in time, or drawn once an episode, leaves the floor of a frame as it is: it is
 what episodes differ by.
@@ -36,7 +36,7 @@ LOSSES = ("mse", "mae", "l2", "pair_mae", "pair_l2")
 FPS = 20.0
 SHORTEST, LONGEST = 40, 80
 POPULATION = 8_000
-DRAWS = 500_000
+DRAWS = 300_000
 
 Losses = dict[str, Any]
 """What LOSSES names: one number each, or [N] at N states."""

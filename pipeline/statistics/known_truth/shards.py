@@ -88,8 +88,8 @@ def plan(size: Size) -> list[Shard]:
 
     for resampled in (True, False) if full else (True,):
         for seeds in (5, 1) if full else (5,):
-            add("null", 400 if full else 80, 40, generator="arm", episodes=50, seeds=seeds, resampled=resampled)
-    floors = {300: 60, 200: 100, 100: 400, 50: 400, 20: 10} if full else {100: 40, 50: 40, 20: 4}
+            add("null", 400 if full else 60, 20, generator="arm", episodes=50, seeds=seeds, resampled=resampled)
+    floors = {300: 60, 200: 100, 100: 400, 50: 400, 20: 10} if full else {100: 30, 50: 30, 20: 2}
     for episodes, repeats in floors.items():
         for generator in GENERATORS:
             add("floors", repeats, 20 if episodes > 150 else 50, generator=generator, episodes=episodes)
@@ -98,7 +98,7 @@ def plan(size: Size) -> list[Shard]:
         repeats = (10 if several else 40) if full else 3
         if full or generator in ("coin", "skewed"):
             what = {"generator": generator, "observations": observations, "episodes": 50}
-            add("modes", repeats, 10, **what)
+            add("modes", repeats, 5, **what)
     for rate in (0.0, 0.1, 0.5, 1.0):
         add("curve", 1000 if full else 60, 100, rate=rate)
     for shape in SHAPES:
@@ -120,7 +120,7 @@ def run_shards(
 ) -> float:
     """Compute what is not in `folder` yet; returns the seconds of all shards together, those found included.
 
-    Each process has one BLAS thread. Ctrl-C waits for the shards at work, a few seconds, and leaves whole files only.
+    Each process has one BLAS thread. Ctrl-C waits for the shards at work, some seconds, and leaves whole files only.
 
     Parameters
     ----------

@@ -1,0 +1,329 @@
+"""What a table's tests and floors say, in sentences: the same words on the page and in the terminal.
+
+What belongs here: choosing what to say, and wording, from the table's own fields. What does not: HTML, terminal markup,
+tests. Nothing here calls one policy better than another unless a comparison of the table does.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pipeline.methods import METHODS
+from pipeline.sinks.words import common_unit, decimals_for, is_number, plural, show, show_interval
+
+Table = Mapping[str, Any]
+Row = Mapping[str, Any]
+
+MARKS = {"better": "✓", "cannot tell": "?", "worse": "✗", "not comparable": "–"}
+"""Beside a verdict's word, so that neither colour nor reading is needed to find it."""
+LOSSES = {"rmse": "RMSE", "mae": "MAE", "l2": "L2"}
+MOST_NAMED = 5
+
+
+NOT_HELD = "no policy is held against a floor under protocol notebook: it averages over frames, a floor over episodes"
+
+
+class Strong(str):
+    """A part of a sentence that stands out."""
+
+    __slots__ = ()
+
+
+Sentence = list[str]
+"""Parts of a sentence, one after another; some are `Strong`."""
+
+
+def answer(table: Table) -> list[Sentence]:
+    """What a reader wants to know first, each with the test or the floor that carries it."""
+    rows = [row for row in table["policies"] if is_number(row["first_step_mae"])]
+    found = []
+    if rows:
+        best = min(rows, key=lambda row: row["first_step_mae"])
+        found = [_best(table, best), *_second(table, rows, best), *_against_still(table, rows, best)]
+        found += [*_against_champion(table, rows), *_first_step_floor(table, best), *_later_floor(table, best)]
+    driven = [row for row in table["policies"] if row["rollouts"]]
+    return [*found, _best_driven(driven)] if driven else found
+
+
+# Policies -------------------------------------------------------------------------------------------------------------
+
+
+def address(row: Row) -> str:
+    return f"{row['policy']}/{row['observations']}"
+
+
+def name_in(table: Table, where: str) -> str:
+    """A row's address as people read it: the policy, and its observation set if it comes with several."""
+    policy, _, observations = where.partition("/")
+    several = sum(row["policy"] == policy for row in table["policies"]) > 1
+    return f"{policy} ({observations})" if several and observations else policy
+
+
+def who(row: Row) -> Sentence:
+    """A policy, and what it sees if its answer depends on that."""
+    asks = row["method"] not in METHODS or METHODS[row["method"]].uses_observations
+    return [Strong(row["policy"]), f" seeing {row['observations']}" if asks else ""]
+
+
+def champion(table: Table) -> str | None:
+    """The address of the champion, its name where it has no row, or None where none was named."""
+    if not any(row["verdict"]["vs_champion"] for row in table["policies"]):
+        return None
+    others = [c["b"] for c in table["comparisons"] if not c["b"].startswith("hold_still/")]
+    return others[0] if others else next(c["b"] for c in table["comparisons"])
+
+
+def compared(table: Table, a: str, b: str, metric: str = "first_step_mae") -> Mapping[str, Any] | None:
+    """The comparison of a with b, if there is one: b is an address, or a policy's name."""
+    found = (
+        comparison
+        for comparison in table["comparisons"]
+        if (comparison["a"], comparison["metric"]) == (a, metric)
+        and b in (comparison["b"], comparison["b"].split("/")[0])
+    )
+    return next(found, None)
+
+
+def family(table: Table) -> int:
+    """How many comparisons were tested, and so share one correction."""
+    return sum(comparison["p_holm"] is not None for comparison in table["comparisons"])
+
+
+def dataset_unit(table: Table) -> str:
+    """The unit of the actions, with a space before it, or nothing where it is unknown."""
+    unit = common_unit(table["dataset"]["action_units"])
+    return f" {unit}" if unit else ""
+
+
+def _best(table: Table, best: Row) -> Sentence:
+    interval = show_interval((best.get("interval") or {}).get("first_step_mae"))
+    value = Strong(f"{show(best['first_step_mae'])}{dataset_unit(table)}")
+    said = ["The lowest first-step error is that of ", *who(best), ": ", value, f" {interval}".rstrip(), ". "]
+    if best["policy"] == "hold_still":
+        return [*said, "So no policy is better than holding still."]
+    found = compared(table, address(best), "hold_still")
+    if found is None:
+        return said
+    if found["word"] == "better":
+        ratio = f", whose error is {show(best['vs_hold_still'])} times as large" if best["vs_hold_still"] else ""
+        return [*said, "It is ", Strong("better than hold-still"), f"{ratio}.", _one_network(table, best)]
+    if found["word"] == "not comparable":
+        return [*said, f"It cannot be compared with hold-still: {found['words']}."]
+    return [*said, "It ", Strong("cannot be told from hold-still"), f": {found['words']}."]
+
+
+def _one_network(table: Table, row: Row) -> str:
+    return " With one seed this is about one network, not its method." if row["params"] and row["seeds"] == 1 else ""
+
+
+def _against_still(table: Table, rows: Sequence[Row], best: Row) -> list[Sentence]:
+    """Who else cannot be told from hold-still, and who is worse."""
+    words = {address(row): row["verdict"]["vs_hold_still"] for row in rows if row is not best}
+    uncertain, worse = ([a for a, word in words.items() if word == w] for w in ("cannot tell", "worse"))
+    said: Sentence = []
+    if uncertain:
+        said += ["At the first step ", _listed(table, uncertain), " ", Strong("cannot be told from hold-still"), ". "]
+    if worse:
+        said += [Strong("Worse than hold-still"), " at the first step: ", _listed(table, worse), "."]
+    return [said] if said else []
+
+
+def _listed(table: Table, addresses: Sequence[str]) -> str:
+    names = [name_in(table, where) for where in addresses]
+    if len(names) > MOST_NAMED:
+        return f"{', '.join(names[: MOST_NAMED - 2])} and {len(names) - MOST_NAMED + 2} more"
+    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
+
+
+def _against_champion(table: Table, rows: Sequence[Row]) -> list[Sentence]:
+    named = champion(table)
+    if named is None:
+        return []
+    words = {address(row): row["verdict"]["vs_champion"] for row in rows}
+    groups = {word: [a for a, w in words.items() if w == word] for word in MARKS}
+    if groups["not comparable"] and not any(groups[word] for word in ("better", "worse", "cannot tell")):
+        why = next(c["words"] for c in table["comparisons"] if c["word"] == "not comparable" and c["b"] == named)
+        return [["Nothing can be compared with the champion: ", f"{why}."]]
+    parts = [f"{word}: {_listed(table, group)}" for word, group in groups.items() if group]
+    return [["At the first step, against the champion ", Strong(name_in(table, named)), f" – {'; '.join(parts)}."]]
+
+
+def _second(table: Table, rows: Sequence[Row], best: Row) -> list[Sentence]:
+    """The next row: told apart where the table's comparisons hold the two, else how to find out."""
+    others = sorted((row for row in rows if row is not best), key=lambda row: row["first_step_mae"])
+    if not others or "hold_still" in (best["policy"], others[0]["policy"]):
+        return []
+    second, name = others[0], name_in(table, address(others[0]))
+    forth, back = compared(table, address(best), address(second)), compared(table, address(second), address(best))
+    if (forth and forth["word"] == "better") or (back and back["word"] == "worse"):
+        return [["It is ", Strong("better than the second"), f", {name}."]]
+    if found := forth or back:
+        return [["It ", Strong("cannot be told from the second"), f", {name}: {found['words']}."]]
+    all_pairs = f"demobench compare {table['dataset']['name']}"
+    return [["Whether it is better than the second, ", name, f", is not tested here; {all_pairs} tests all pairs."]]
+
+
+def _best_driven(rows: Sequence[Row]) -> Sentence:
+    most = max(rows, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]))
+    n, rate, interval = most["rollouts"]["n"], most["rollouts"]["success"], most["rollouts"].get("success_interval")
+    if rate == 0:
+        none = f"In closed loop no policy succeeds from any of {n} start states; the highest score is that of "
+        return [none, *who(most), ": ", Strong(show(most["rollouts"]["score"])), "."]
+    percent = f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f} %)" if show_interval(interval) else ""
+    return ["In closed loop ", *who(most), " succeeds most often: ", Strong(f"{round(rate * n)} of {n}"), f"{percent}."]
+
+
+# Floors ---------------------------------------------------------------------------------------------------------------
+
+
+def ahead(horizon: int, fps: float) -> str:
+    """When an action is, seen from its anchor."""
+    if horizon == 0:
+        return "first action"
+    return "one second ahead" if horizon == round(fps) else f"{horizon / fps:.2g} s ahead"
+
+
+def capital(words: str) -> str:
+    return words[:1].upper() + words[1:]
+
+
+def floors_of(table: Table) -> list[Mapping[str, Any]]:
+    """The estimates that policies are held against; those of the notebook's estimator are not."""
+    return [floor for floor in table["floor"]["estimates"] if floor["estimator"] != "radius"]
+
+
+def bracket_of(table: Table, floor: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The bracket that belongs to a floor; None where no policy reaches its horizon."""
+    keys = ("observations", "horizon", "loss")
+    return next((b for b in table["brackets"] if all(b[key] == floor[key] for key in keys)), None)
+
+
+def why_not(floor: Mapping[str, Any], bracket: Mapping[str, Any] | None) -> str | None:
+    """Why there is no floor: the estimator refused, or a policy is significantly below what it found."""
+    if floor["refused"]:
+        return floor["refused"]
+    refused = bracket is not None and bracket["lower"] is None
+    return bracket["words"].removeprefix("refused: ") if refused else None
+
+
+def not_above(floor: Mapping[str, Any], bracket: Mapping[str, Any] | None) -> tuple[float, str | None] | None:
+    """What a refused floor does not exceed, and the policy that shows it, if it is one: a floor is below every error."""
+    limits: list[tuple[float, str | None]] = [(floor["below"], None)] if is_number(floor["below"]) else []
+    if bracket is not None and is_number(bracket["upper"]):
+        limits.append((bracket["upper"], bracket["upper_policy"]))
+    return min(limits, key=lambda limit: limit[0]) if limits else None
+
+
+def limit_words(table: Table, floor: Mapping[str, Any], bracket: Mapping[str, Any] | None) -> str:
+    """`not above 3.34 px`, or who is already there; nothing where nothing is known."""
+    limit = not_above(floor, bracket)
+    if limit is None:
+        return ""
+    value = f"{show(limit[0])}{dataset_unit(table)}"
+    return f"not above {value}" if limit[1] is None else f"not above {value}, which {name_in(table, limit[1])} reaches"
+
+
+def first_step_gap(row: Row) -> Mapping[str, Any] | None:
+    """How far a row's first action is above the floor of what it sees, in squared error (RMSE)."""
+    gaps = (gap for gap in row["above_floor"] if (gap["horizon"], gap["loss"]) == (0, "rmse") and is_number(gap["gap"]))
+    return next(gaps, None)
+
+
+def gap_parts(gap: Mapping[str, Any]) -> tuple[str, str]:
+    """A gap in short, and what stands beside it: `3.10`, `[2.30, 3.90]`; `at the floor`, `±0.81`."""
+    low, high = gap["interval"] or (None, None)
+    if low is None:
+        return show(gap["gap"]), ""
+    if high < 0:
+        return "below", "so the floor is wrong"
+    if low <= 0:
+        return "at the floor", f"±{show(max(high, -low))}"
+    return show(gap["gap"]), show_interval((low, high), decimals_for([high]))
+
+
+def not_held(table: Table) -> bool:
+    """Whether floors were measured that no policy can be held against."""
+    return table["protocol"] == "notebook" and bool(floors_of(table))
+
+
+def floors_at_first_step(table: Table) -> dict[str, Mapping[str, Any]]:
+    """Of every observation set the floor in squared error that first actions are held against."""
+    return {f["observations"]: f for f in floors_of(table) if (f["horizon"], f["loss"]) == (0, "rmse")}
+
+
+def without_floor(table: Table) -> dict[str, str]:
+    """Why rows that see an observation set have no gap at the first action; observation set → reason.
+
+    Empty under `notebook`, where nothing is held against a floor at all (`NOT_HELD`).
+    """
+    if not table["brackets"]:
+        return {}
+    found = {name: why_not(f, bracket_of(table, f)) for name, f in floors_at_first_step(table).items()}
+    return {name: why for name, why in found.items() if why is not None}
+
+
+def _first_step_floor(table: Table, best: Row) -> list[Sentence]:
+    """How far the best row's first action is from its floor, or why nobody can tell."""
+    gap, rmse = first_step_gap(best), f"{dataset_unit(table)} RMSE"
+    if gap is not None:
+        short, beside = gap_parts(gap)
+        of = f"policies seeing {best['observations']}"
+        if short == "below":
+            return [["It is below the estimated floor, so that estimate is wrong for this data."]]
+        if short == "at the floor":
+            return [["It is ", Strong("at the floor"), f" of {of} at the first action, {beside}{rmse}."]]
+        above = Strong(f"{short}{rmse} above the floor")
+        return [["It is ", above, f" {beside}: for {of} that is {show(gap['floor'])} at the first action."]]
+    why = without_floor(table).get(best["observations"])
+    if why is None:
+        return []
+    floor = floors_at_first_step(table)[best["observations"]]
+    limit = limit_words(table, floor, bracket_of(table, floor))
+    rest = f" The floor is {limit} (RMSE)." if limit else ""
+    return [[Strong("No floor"), f" can be given at the first action: {why.split(': ')[0]}.{rest}"]]
+
+
+def _later_floor(table: Table, best: Row) -> list[Sentence]:
+    """The bracket furthest ahead that has a lower end: the best row's observation set and squared error come first."""
+    known = [b for b in table["brackets"] if b["horizon"] > 0 and b["lower"] is not None and b["loss"] != "l2"]
+    if not known:
+        return []
+    sees = best["observations"]
+    found = min(known, key=lambda b: (-b["horizon"], b["observations"] != sees, b["loss"] != "rmse", b["upper"]))
+    when, unit, loss = ahead(found["horizon"], table["dataset"]["fps"]), dataset_unit(table), LOSSES[found["loss"]]
+    said = [f"{capital(when)} ", Strong(name_in(table, found["upper_policy"]))]
+    said += [f" reaches {show(found['upper'])}{unit} {loss}, {gap_words(found, unit)}"]
+    return [[*said, f" of policies seeing {found['observations']}."]]
+
+
+def gap_words(bracket: Mapping[str, Any], unit: str = "") -> str:
+    """What lies between the floor and the best policy, in words."""
+    if bracket["lower"] is None:
+        return ""
+    low, high = bracket["interval"] or (None, None)
+    if low is None:
+        return f"{show(bracket['gap'])}{unit} above the floor"
+    if bracket["loss"] != "rmse":
+        return f"at most {show(high)}{unit} above the floor"
+    if low <= 0:
+        return f"at the floor, within ±{show(max(high, -low))}{unit}"
+    return f"{show(bracket['gap'])}{unit} {show_interval((low, high), decimals_for([high]))} above the floor"
+
+
+def families_words(table: Table) -> str:
+    """What a verdict rests on, in one sentence."""
+    number = family(table)
+    if not number:
+        return "No difference was tested: a verdict needs at least five held-out episodes."
+    together = f"{plural(number, 'comparison')} in one family" if number > 1 else "One comparison"
+    return f"{together}; a verdict needs p ≤ 0.05 after Holm's correction."
+
+
+def interval_words(table: Table) -> str:
+    """How the intervals of the table were made, in short; rows with few episodes go by t."""
+    methods = {row["interval_method"] for row in table["policies"] if (row.get("interval") or {}).get("first_step_mae")}
+    if not methods:
+        return "no interval below 5 held-out episodes"
+    several_seeds = any(row["seeds"] > 1 for row in table["policies"])
+    over = "held-out episodes and seeds" if several_seeds else "held-out episodes"
+    given = ", for these folds" if len(table["split"]["folds"]) > 1 else ""
+    return f"95 % interval: {' and '.join(sorted(methods))} over {over}{given}"

@@ -1,0 +1,167 @@
+"""What is said of a table: only what a comparison or a floor of the table carries."""
+
+import pytest
+
+from pipeline.sinks.findings import (
+    Strong,
+    ahead,
+    answer,
+    champion,
+    family,
+    gap_parts,
+    gap_words,
+    interval_words,
+    limit_words,
+    name_in,
+    without_floor,
+)
+
+from .making import make_bracket, make_comparison, make_gap, make_refusal, make_row, make_verdict
+
+
+def said(table) -> list[str]:
+    return ["".join(sentence) for sentence in answer(table)]
+
+
+def test_the_answer_of_a_benchmark(table):
+    assert said(table) == [
+        "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]. It is better than hold-still, whose "
+        "error is 4.44 times as large.",
+        "Whether it is better than the second, mlp_k04, is not tested here; demobench compare small tests all pairs.",
+        "It is 1.62 px RMSE above the floor [1.25, 2.00]: for policies seeing state that is 4.00 at the first action.",
+        "In closed loop mlp_k04 seeing state succeeds most often: 41 of 50 (69–91 %).",
+    ]
+    assert Strong("better than hold-still") in answer(table)[0]
+
+
+def test_nothing_is_called_better_without_a_test(table):
+    table["comparisons"] = []
+    for row in table["policies"]:
+        row["verdict"] = make_verdict()
+    first = said(table)[0]
+    assert first == "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]. "
+
+
+@pytest.mark.parametrize(
+    ("word", "words"),
+    [
+        ("cannot tell", "It cannot be told from hold-still: about 90 held-out episodes would do."),
+        ("not comparable", "It cannot be compared with hold-still: about 90 held-out episodes would do."),
+    ],
+)
+def test_a_doubt_is_said_with_its_reason(table, word, words):
+    reason = "about 90 held-out episodes would do"
+    table["comparisons"][0] = make_comparison("mlp_k01/state", "hold_still/state", word, words=reason)
+    assert said(table)[0].endswith(words)
+
+
+def test_one_seed_is_one_network(table):
+    table["policies"][0]["seeds"] = 1
+    assert said(table)[0].endswith("With one seed this is about one network, not its method.")
+
+
+def test_those_that_are_no_better_than_hold_still_are_named(demos, table):
+    for place, word in enumerate(("cannot tell", "worse", "worse")):
+        verdict = make_verdict(vs_hold_still=word)
+        table["policies"].append(make_row(f"act_k{place}", "act", demos, error=30.0 + place, verdict=verdict))
+    assert (
+        "At the first step act_k0 cannot be told from hold-still. Worse than hold-still at the first step: act_k1 and act_k2."
+    ) in said(table)
+
+
+def test_long_lists_are_cut(demos, table):
+    verdict = make_verdict(vs_hold_still="worse")
+    table["policies"] += [make_row(f"p{i}", "act", demos, error=30.0 + i, verdict=verdict) for i in range(9)]
+    assert "Worse than hold-still at the first step: p0, p1, p2 and 6 more." in said(table)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "word", "expected"),
+    [
+        ("mlp_k01/state", "mlp_k04/state", "better", "It is better than the second, mlp_k04."),
+        ("mlp_k04/state", "mlp_k01/state", "worse", "It is better than the second, mlp_k04."),
+        ("mlp_k04/state", "mlp_k01/state", "cannot tell", "It cannot be told from the second, mlp_k04: the reason."),
+    ],
+)
+def test_the_second_is_told_apart_only_by_a_comparison(table, a, b, word, expected):
+    table["comparisons"].append(make_comparison(a, b, word, words="the reason"))
+    assert said(table)[1] == expected
+
+
+def test_the_champion(table):
+    assert champion(table) is None
+    table["comparisons"].append(make_comparison("mlp_k04/state", "mlp_k01/state", "worse"))
+    table["policies"][1]["verdict"] = make_verdict(vs_hold_still="better", vs_champion="worse")
+    assert champion(table) == "mlp_k01/state"
+    assert "At the first step, against the champion mlp_k01 – worse: mlp_k04." in said(table)
+
+
+def test_a_champion_that_has_no_row_is_said_to_have_none(table):
+    why = "the champion 'gone' has no up-to-date result here"
+    for row in table["policies"][:2]:
+        row["verdict"] = make_verdict(vs_hold_still="better", vs_champion="not comparable")
+        table["comparisons"].append(make_comparison(f"{row['policy']}/state", "gone", "not comparable", words=why))
+    assert f"Nothing can be compared with the champion: {why}." in said(table)
+    assert family(table) == 2
+
+
+def test_hold_still_can_be_the_champion(table):
+    for row in table["policies"][:2]:
+        row["verdict"] = make_verdict(vs_hold_still="better", vs_champion="better")
+    assert champion(table) == "hold_still/state"
+
+
+def test_a_refused_floor_is_said_with_what_is_known(table):
+    table["policies"][0]["above_floor"] = []
+    table["floor"]["estimates"] = [make_refusal()]
+    table["brackets"] = [make_bracket(lower=None)]
+    known = "No floor can be given at the first action: the states differ. The floor is not above 5.62 px, which mlp_k01 reaches"
+    assert f"{known} (RMSE)." in said(table)
+    table["floor"]["estimates"] = [make_refusal(below=3.3444)]
+    assert any("The floor is not above 3.34 px (RMSE)." in sentence for sentence in said(table))
+    assert without_floor(table) == {"state": "the states differ: too much"}
+    assert limit_words(table, make_refusal(below=None), None) == ""
+
+
+def test_a_floor_that_a_policy_refutes_is_withdrawn(table):
+    table["brackets"][0] |= {"lower": None, "words": "refused: mlp_k01/state is significantly below the estimate"}
+    assert without_floor(table) == {"state": "mlp_k01/state is significantly below the estimate"}
+
+
+def test_one_sentence_looks_further_ahead(table):
+    table["brackets"] += [make_bracket(horizon=10), make_bracket("mae", horizon=10)]
+    table["brackets"] += [make_bracket(horizon=5), make_bracket("l2", horizon=12)]
+    (found,) = [sentence for sentence in said(table) if "ahead" in sentence]
+    assert (
+        found
+        == "One second ahead mlp_k01 reaches 5.62 px RMSE, 1.62 px [1.25, 2.00] above the floor of policies seeing state."
+    )
+
+
+def test_gaps_in_words():
+    assert gap_parts(make_gap()) == ("1.62", "[1.25, 2.00]")
+    assert gap_parts(make_gap(gap=0.1, interval=[-0.75, 0.5])) == ("at the floor", "±0.750")
+    assert gap_parts(make_gap(gap=-1.0, interval=[-2.0, -0.5])) == ("below", "so the floor is wrong")
+    assert gap_parts(make_gap(interval=None)) == ("1.62", "")
+    assert gap_words(make_bracket("mae")) == "at most 2.00 above the floor"
+    assert gap_words(make_bracket(interval=[-0.75, 0.5])) == "at the floor, within ±0.750"
+    assert gap_words(make_bracket(lower=None)) == ""
+
+
+def test_times_and_names(demos, table):
+    assert [ahead(h, 10.0) for h in (0, 10, 7)] == ["first action", "one second ahead", "0.7 s ahead"]
+    assert name_in(table, "mlp_k01/state") == "mlp_k01"
+    table["policies"].append(make_row("mlp_k01", "mlp", demos, observations="pose"))
+    assert name_in(table, "mlp_k01/state") == "mlp_k01 (state)"
+    assert name_in(table, "mlp_k01") == "mlp_k01"
+
+
+def test_how_intervals_were_made(table):
+    assert interval_words(table) == "95 % interval: bootstrap-t over held-out episodes and seeds"
+    table["split"]["folds"] *= 5
+    for row in table["policies"]:
+        row |= {"seeds": 1, "interval_method": "t"}
+    assert interval_words(table) == "95 % interval: t over held-out episodes, for these folds"
+    for row in table["policies"]:
+        row |= {"interval": {"first_step_mae": None}, "interval_method": None}
+    assert interval_words(table) == "no interval below 5 held-out episodes"
