@@ -1,5 +1,6 @@
 """The benchmark: one table of policies, baselines and floors, and one page that shows it."""
 
+import json
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,19 +16,19 @@ TABLE = dg.AssetKey(["benchmark_table"])
 REPORT = dg.AssetKey(["benchmark_report"])
 
 
-def benchmark_assets(deps: Sequence[dg.AssetKey], floor: dg.AssetsDefinition) -> list[dg.AssetsDefinition]:
+def benchmark_assets(deps: Sequence[dg.AssetKey], floors: Sequence[dg.AssetsDefinition]) -> list[dg.AssetsDefinition]:
     """The table and the page; `deps` are the predictions and roll-outs of every policy."""
-    benchmark_table = _benchmark_table(deps, floor)
+    benchmark_table = _benchmark_table(deps, floors)
     return [benchmark_table, _benchmark_report(benchmark_table)]
 
 
-def _benchmark_table(deps: Sequence[dg.AssetKey], floor: dg.AssetsDefinition) -> dg.AssetsDefinition:
+def _benchmark_table(deps: Sequence[dg.AssetKey], floors: Sequence[dg.AssetsDefinition]) -> dg.AssetsDefinition:
     @dg.asset(
         key=TABLE,
         partitions_def=PARTITIONS,
         group_name="benchmark",
         kinds={"json"},
-        deps=[demonstrations, episode_split, floor, *deps],
+        deps=[demonstrations, episode_split, *floors, *deps],
         code_version=code_version("benchmark_table"),
         check_specs=[
             check_spec(TABLE, "baselines_present", "Hold-still is in the table: every error is read against it."),
@@ -84,7 +85,8 @@ def _write_table(bench: Bench, draft) -> Outcome:
     floor = plan.folder(Unit("multimodality_floor"))
     floors, estimates = load_floors(floor / "radius.json"), load_estimates(floor / "estimates.json")
     facts = bench.summary(Unit("demonstrations"))["inspect"]
-    built = build_table(facts, bench.experiment, bench.split, floors, estimates, entries)
+    modes = json.loads((plan.folder(Unit("action_modes")) / "modes.json").read_text(encoding="utf-8"))
+    built = build_table(facts, bench.experiment, bench.split, floors, estimates, entries, modes)
     write_json(draft / "table.json", built)
     rows = [
         (
@@ -163,8 +165,6 @@ def _benchmark_report(benchmark_table: dg.AssetsDefinition) -> dg.AssetsDefiniti
 
 
 def _write_report(bench: Bench, draft) -> Outcome:
-    import json
-
     from pipeline.predict import load_predictions
     from pipeline.simulate.trial import load_rollouts
     from pipeline.sinks.figures import benchmark_figures

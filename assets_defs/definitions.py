@@ -59,7 +59,7 @@ def build_defs(
         *floor.ASSETS,
         *branches,
         *curve_assets(predictions),
-        *benchmark_assets([*predictions, *rollouts], floor.multimodality_floor),
+        *benchmark_assets([*predictions, *rollouts], floor.ASSETS),
         *looking_assets(predictions),
     ]
     return dg.Definitions(

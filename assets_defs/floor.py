@@ -1,4 +1,4 @@
-"""The floor: how small can the error of any deterministic policy get on these demonstrations?"""
+"""The floor: how small can the error of any deterministic policy get on these demonstrations, and do people do several things?"""
 
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec,
 from assets_defs.show import picture, present, table
 
 KEY = dg.AssetKey(["multimodality_floor"])
+MODES = dg.AssetKey(["action_modes"])
 
 
 @dg.asset(
@@ -84,4 +85,54 @@ def _words(interval: tuple[float, float] | None) -> str | None:
     return f"{interval[0]:.4g} … {interval[1]:.4g}" if interval else None
 
 
-ASSETS = [multimodality_floor]
+@dg.asset(
+    key=MODES,
+    partitions_def=PARTITIONS,
+    group_name="floor",
+    kinds={"pytorch"},
+    deps=[demonstrations],
+    code_version=code_version("action_modes"),
+    check_specs=[check_spec(MODES, "said_or_refused", "Every observation set and horizon has an answer or a reason.")],
+)
+def action_modes(
+    context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
+) -> dg.MaterializeResult:
+    """Do people do clearly different things at the same observation? Evidence of modes, apart from any floor.
+
+    One small network with one Gaussian against the same network with a mixture, both scored on episodes they did not see.
+    Many apparent modes are missing information: look at the larger observation sets.
+    """
+    bench = workbench.open(context, budget)
+    made = bench.make(Unit("action_modes"), lambda draft: _look_for_modes(bench, draft))
+    header = ["observations", "horizon", "gain, nats a state", "share of states with several peaks", "answer"]
+    return result(bench, MODES, {"": made}, {"modes": table(header, made.summary["rows"])}, ["said_or_refused"])
+
+
+def _look_for_modes(bench: Bench, draft: Path) -> Outcome:
+    from dataclasses import asdict
+
+    from pipeline.statistics.modes import evidence_of_modes
+    from pipeline.store import write_json
+    from pipeline.table import json_safe
+
+    demos, sets = bench.demonstrations, bench.experiment.observation_sets
+    found = []
+    for seen in sets:
+        found += evidence_of_modes(
+            demos,
+            bench.semantics,
+            seen,
+            history=bench.experiment.history,
+            horizons=bench.experiment.floor_horizons(demos.fps),
+            on_step=lambda done, total, loss, name=seen.name: bench.progress(
+                f"modes {name}", done, total, f"loss {loss:.4g}"
+            ),
+        )
+    write_json(draft / "modes.json", json_safe([asdict(one) for one in found]))
+    rows = [(one.observations, one.horizon, one.gain, one.share, one.words or one.refused) for one in found]
+    answered = sum(one.found is not None for one in found)
+    sound = all((one.found is None) == (one.refused is not None) for one in found)
+    return Outcome({"rows": rows}, {"said_or_refused": (sound, f"{answered} of {len(found)} answered")})
+
+
+ASSETS = [multimodality_floor, action_modes]

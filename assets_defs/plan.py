@@ -22,19 +22,20 @@ CODE_VERSIONS = {
     "demonstrations": "1",
     "episode_split": "1",
     "windows": "1",
-    "multimodality_floor": "2",
+    "multimodality_floor": "3",
+    "action_modes": "1",
     "learning_curve": "1",
     "trained_policy": "1",
     "predictions": "2",
     "rollouts": "1",
-    "benchmark_table": "2",
-    "benchmark_report": "3",
+    "benchmark_table": "3",
+    "benchmark_report": "4",
     "mcap_log": "1",
     "rerun_recording": "1",
 }
 """Raised by hand when what an asset computes changes: everything downstream becomes stale."""
 
-DATA = ("demonstrations", "episode_split", "windows", "multimodality_floor")
+DATA = ("demonstrations", "episode_split", "windows", "multimodality_floor", "action_modes")
 SUMMARIES = ("benchmark_table", "benchmark_report", "mcap_log", "rerun_recording")
 POLICY = ("trained_policy", "predictions", "rollouts")
 
@@ -176,7 +177,7 @@ class Plan:
         match unit.kind:
             case "demonstrations":
                 return []
-            case "episode_split":
+            case "episode_split" | "action_modes":
                 return [data]
             case "windows" | "multimodality_floor":
                 return [data, Unit("episode_split")]
@@ -191,7 +192,7 @@ class Plan:
             case "benchmark_table":
                 kinds = ("predictions", "rollouts")
                 policies = [u for kind in kinds for v in self.variants for u in self.policy_units(v, kind)]
-                return [Unit("episode_split"), Unit("multimodality_floor"), *policies]
+                return [*(Unit(a) for a in ("episode_split", "multimodality_floor", "action_modes")), *policies]
             case _:
                 policies = [u for v in self.variants for u in self.policy_units(v, "predictions")]
                 return [*([Unit("benchmark_table")] if unit.kind == "benchmark_report" else []), *policies]
@@ -212,6 +213,10 @@ class Plan:
                     "horizons": e.dataset.floor_horizons,
                 }
                 return settings | _dump(e, {"history"})
+            case "action_modes":
+                return {"observations": e.dataset.observations, "horizons": e.dataset.floor_horizons} | _dump(
+                    e, {"history"}
+                )
             case "trained_policy":
                 variant = self._variant_named[unit.asset.split("/")[0]]
                 settings = {"method": variant.method, "chunk": variant.chunk, "windows": CODE_VERSIONS["windows"]}

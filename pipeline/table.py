@@ -49,6 +49,7 @@ def build_table(
     floors: Sequence[RadiusFloor],
     estimates: Sequence[FloorEstimate],
     entries: Sequence[Mapping[str, Any]],
+    modes: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """The table of one data set.
 
@@ -58,6 +59,7 @@ def build_table(
     floors, estimates : the notebook's floors, and those that policies are held against.
     entries : one a row: `variant`, `observations`, `metrics` (`metrics.Score.metrics`), `errors` (`EpisodeErrors`),
         `windows_train`, `windows_test`, `latency_ms`, `parameters`, `train_s` and `rollouts` (a summary or None).
+    modes : `modes.ModesEvidence` as dictionaries.
 
     Returns
     -------
@@ -77,6 +79,7 @@ def build_table(
         },
         "floor": floor_json(floors, estimates),
         **against_floors,
+        "modes": list(modes),
         "policies": rows,
         "comparisons": comparisons,
         "artifacts": {"report": None, "mcap": None, "rerun": None, "mlflow": None},

@@ -19,7 +19,7 @@ from pipeline.sinks import explanations, replacing
 from pipeline.sinks.findings import Strong, answer
 from pipeline.sinks.markup import Html, element, join, json_for_script, script_text
 from pipeline.sinks.page_style import draw_script, style_sheet, themed
-from pipeline.sinks.report_sections import comparison_section, floor_section, sensor_section
+from pipeline.sinks.report_sections import comparison_section, floor_section, modes_section, sensor_section
 from pipeline.sinks.report_table import benchmark_table, column_table
 from pipeline.sinks.words import plural
 
@@ -113,6 +113,7 @@ def _body(table: Table, sections: Mapping[str, list[Html]], provenance: Provenan
         element("noscript", element("p", "The pictures below need JavaScript; nothing is loaded from anywhere.")),
         floor_section(table, sections["floors"]),
         sensor_section(table),
+        modes_section(table),
         comparison_section(table),
         element("div", sections["policies"], class_="figures"),
         element(

@@ -80,6 +80,34 @@ def floor_section(table: Table, figures: Sequence[Html]) -> Html | None:
     )
 
 
+def modes_section(table: Table) -> Html | None:
+    """Whether people do several things at the same observation; None where nothing was looked for."""
+    if not table.get("modes"):
+        return None
+    said = (
+        "A floor says how much actions scatter, not how. Here a network that may give several answers was held against the "
+        "same network with one, on episodes that neither saw. Several peaks with few sensors can be missing information: "
+        "look at what sees more."
+    )
+    heads = ["When", "Sees", "Answer"]
+    fps = table["dataset"]["fps"]
+    rows = [
+        [
+            Cell(capital(ahead(one["horizon"], fps))),
+            Cell(one["observations"]),
+            Cell(one["words"] or f"Not looked for: {one['refused']}", wraps=True),
+        ]
+        for one in table["modes"]
+    ]
+    caption = "Evidence of modes. Numbers in brackets are 95 % intervals."
+    return element(
+        "section",
+        element("h2", "Do people do several things in the same place?"),
+        element("p", said),
+        _table(caption, heads, rows, f"All {len(rows)} answers"),
+    )
+
+
 def _floor_row(table: Table, floor: Mapping[str, Any]) -> list[Cell]:
     bracket = findings.bracket_of(table, floor)
     frames = f"{floor['history']} frame{'s' * (floor['history'] != 1)}"

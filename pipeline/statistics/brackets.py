@@ -76,9 +76,10 @@ class Scored:
 
 @dataclass(frozen=True)
 class Gap:
-    """How far an error lies above a floor, in the unit of the loss; `interval` None where it cannot be had."""
+    """How far an error lies above a floor, in the unit of the loss; intervals are None where they cannot be had."""
 
     error: float
+    error_interval: tuple[float, float] | None
     gap: float | None
     interval: tuple[float, float] | None
     words: str
@@ -97,10 +98,12 @@ def gap_to_floor(scored: Scored, floor: FloorEstimate) -> Gap | None:
 def _gap(values: np.ndarray, episodes: np.ndarray, fold: np.ndarray, floor: FloorEstimate) -> Gap:
     mean = estimate_mean(values, fold=fold)
     squared, slope = (mean.value, 1.0) if floor.loss == "rmse" else (mean.value**2, 2 * mean.value)
-    error = float(np.sqrt(squared))
+    error, sure = float(np.sqrt(squared)), mean.interval
+    if sure and floor.loss == "rmse":
+        sure = (float(np.sqrt(max(0.0, sure[0]))), float(np.sqrt(sure[1])))
     if floor.value is None:
         known = "" if floor.below is None else f"; it is at most {floor.below:.4g}"
-        return Gap(error, None, None, f"no floor to hold it against{known}")
+        return Gap(error, sure, None, None, f"no floor to hold it against{known}")
     of_seeds = values.mean(axis=0)
     share = 1.0 if floor.loss == "rmse" else 0.25
     moved = -share * floor.influence
@@ -110,7 +113,7 @@ def _gap(values: np.ndarray, episodes: np.ndarray, fold: np.ndarray, floor: Floo
     centre = squared - floor.value**2
     # From the squared scale to the unit: a gap x of squares is an error less the root of what is left of its square.
     low, high = (float(error - np.sqrt(max(0.0, squared - x))) for x in (centre - half, centre + half))
-    return Gap(error, error - floor.value, (low, high), _gap_words(floor, error - floor.value, low, high))
+    return Gap(error, sure, error - floor.value, (low, high), _gap_words(floor, error - floor.value, low, high))
 
 
 def _gap_words(floor: FloorEstimate, gap: float, low: float, high: float) -> str:
@@ -133,7 +136,8 @@ def form_brackets(
 
     Returns
     -------
-    list of dict : observations, horizon, loss, lower (None where refused), upper, upper_policy, gap, interval, words.
+    list of dict : observations, horizon, loss, lower (None where refused), upper, upper_interval,
+        upper_policy, gap, interval, words.
     """
     brackets = []
     for floor in floors:
@@ -147,7 +151,8 @@ def form_brackets(
         brackets.append(
             {
                 "observations": floor.observations, "horizon": floor.horizon, "loss": floor.loss,
-                "lower": None if refused else floor.value, "upper": gap.error, "upper_policy": name,
+                "lower": None if refused else floor.value, "upper": gap.error,
+                "upper_interval": gap.error_interval, "upper_policy": name,
                 "gap": None if refused else gap.gap, "interval": None if refused else gap.interval,
                 "words": f"refused: {refused}" if refused else f"{name}: {gap.words}",
             }
@@ -210,7 +215,8 @@ def _worth(small: FloorEstimate, large: FloorEstimate, at_small: Mapping | None,
     if not sound[0]:
         return {**described, **nothing, "words": f"not known: there is no floor of {small.observations}"}
     if not sound[1]:
-        limits = [x for x in (large.below, at_large and at_large["upper"]) if x is not None]
+        ends = at_large and at_large["upper_interval"]
+        limits = [x for x in (large.below, ends and ends[1]) if x is not None]
         if not limits or (least := small.interval[0] - min(limits)) <= 0:
             return {**described, **nothing, "words": f"not known: there is no floor of {large.observations}"}
         return {**described, **nothing, "at_least": float(least), "words": f"at least {least:.3g}"}

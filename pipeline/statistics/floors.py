@@ -32,17 +32,20 @@ NEAREST = 10
 """The neighbours of a state that count: one frame of each of so many other episodes."""
 
 FEWER, MORE = 5, 20
-"""Other fits over so many: what they differ by shows how straight the line is."""
+"""Other fits: over fewer, to see how straight the line is; over more, to see whether it is one."""
 
 FEWEST_EPISODES = 30
 MOST_SCORED = 20_000
+MOST_ELSEWHERE = 8_000
+"""States at which the law of the extrapolation is looked at where only some episodes are held out."""
+
 MOST_REMOVED = 0.5
 """The share of the nearest neighbours' value that extrapolation may take away."""
 
 CURVED = 0.12
 """The share of an estimate that a jump in the mean action may account for, before the estimate is refused."""
 
-TOLD_APART, TOLD_APART_TOGETHER = 1.35, 1.6
+TOLD_APART, TOLD_APART_TOGETHER = 1.35, 1.5
 """How many times worse the law of a jump must fit, in mean squared residuals, to be ruled out: one column, all together."""
 
 SHARE_IN_DOUBT = 0.1
@@ -113,15 +116,24 @@ def measure_floors(
     reason = _nothing_to_measure(states)
     horizons = sorted(set(horizons))
     possible = [h for h in horizons if _reaches(states, h)] if reason is None else []
-    found = find_neighbours(states.inputs, demos.episode_starts, states.scored, states.first, possible, keep=MORE)
+    found = _search(states, states.scored, possible)
+    laws = found
+    if len(np.unique(states.episode[states.scored])) < demos.episodes:
+        # Whether a mean jumps is a property of the data, not of the share of them that is scored: all of them can tell.
+        everywhere = scored_frames(demos, np.arange(demos.episodes), states.first, MOST_ELSEWHERE)
+        laws = _search(states, everywhere, possible)
     estimates = []
     for horizon in horizons:
         if horizon in found:
-            estimates += _estimate(states, found[horizon], horizon)
+            estimates += _estimate(states, found[horizon], laws[horizon], horizon)
         else:
             why = reason or f"no two episodes have an action {horizon} steps after a state that is scored"
             estimates += [_refusal(states, horizon, loss, why) for loss in ("rmse", "mae", "l2")]
     return estimates
+
+
+def _search(states: States, scored: np.ndarray, horizons: Sequence[int]) -> dict[int, Neighbours]:
+    return find_neighbours(states.inputs, states.demos.episode_starts, scored, states.first, horizons, keep=MORE)
 
 
 def prepare_states(
@@ -189,19 +201,27 @@ def _reaches(states: States, horizon: int) -> bool:
 # From neighbours to estimates -----------------------------------------------------------------------------------------
 
 
-def _estimate(states: States, found: Neighbours, horizon: int) -> list[FloorEstimate]:
-    pairs = _pairs(states, found)
-    difference = states.actions[found.scored + horizon][:, None] - states.actions[found.frames + horizon]
-    difference[..., states.circular] = wrap(difference[..., states.circular])
+def _estimate(states: States, found: Neighbours, laws: Neighbours, horizon: int) -> list[FloorEstimate]:
+    pairs, difference = _pairs(states, found), _differences(states, found, horizon)
     squared = difference**2
-    half_squares = 0.5 * squared.mean(axis=2)
-    columns = 0.5 * np.tensordot(pairs.weights, squared, axes=1) / squared.shape[2]
-    estimates = [_judge(states, pairs, horizon, "rmse", half_squares, columns)]
+    everywhere, apart_everywhere = pairs, squared
+    if laws is not found:
+        everywhere, apart_everywhere = _pairs(states, laws), _differences(states, laws, horizon) ** 2
+    columns = 0.5 * np.tensordot(everywhere.weights, apart_everywhere, axes=1) / squared.shape[2]
+    jump = _jump(everywhere.curve, columns)
+    estimates = [_judge(states, pairs, horizon, "rmse", 0.5 * squared.mean(axis=2), jump)]
     for loss, apart in (("mae", np.abs(difference).mean(axis=2)), ("l2", np.sqrt(squared.sum(axis=2)))):
         mean = pairs.weights @ apart
         # The square of a mean, pair by pair: its average is mean², and it moves with a pair as the square of the mean does.
         estimates.append(_judge(states, pairs, horizon, loss, mean**2 + 2 * mean * (apart - mean)))
     return estimates
+
+
+def _differences(states: States, found: Neighbours, horizon: int) -> np.ndarray:
+    """[M, K, A] the action of a scored state less that of its neighbour, `horizon` steps later; angles wrapped."""
+    difference = states.actions[found.scored + horizon][:, None] - states.actions[found.frames + horizon]
+    difference[..., states.circular] = wrap(difference[..., states.circular])
+    return difference
 
 
 @dataclass(frozen=True)
@@ -271,11 +291,11 @@ def _line(distance: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, float, f
 
 
 def _judge(
-    states: States, pairs: Pairs, horizon: int, loss: Loss, apart: np.ndarray, columns: np.ndarray | None = None
+    states: States, pairs: Pairs, horizon: int, loss: Loss, apart: np.ndarray, jump: float = 0.0
 ) -> FloorEstimate:
     """One estimate on the squared scale (Γ or D₀²) from the pairs' values [M, K], or the reason why there is none.
 
-    `columns` [K, A] are the parts of their means that come from each action column, where a jump is to be looked for.
+    `jump` is how much of it a jump in the mean action may account for.
     """
     delta, value = pairs.curve, pairs.weights @ apart
     weights, slope, _ = _line(delta[:NEAREST], value[:NEAREST])
@@ -286,13 +306,13 @@ def _judge(
     described = _described(states, horizon, loss) | {
         "influence": influence, "counted_twice": twice, "nearest": float(np.sqrt(delta[0] / states.inputs.shape[1]))
     }  # fmt: skip
-    doubt = _doubt(delta, value, estimate, columns)
+    doubt = _doubt(delta, value, estimate, jump)
     if doubt.refused:
         first = pairs.variance(pairs.weights[:, None] * (apart[:, :1] - value[0]))
         below = _root(value[0] + t_quantile(0.95, pairs.df) * standard_error(*first))
         return FloorEstimate(**described, **NOTHING, below=below, refused=doubt.refused)
     share = 1.0 if loss == "rmse" else 0.5
-    half = float(np.hypot(half, doubt.wrong))
+    half += doubt.wrong
     low, high = _root(estimate - half), _root(estimate + half)
     return FloorEstimate(
         **described, value=share * _root(estimate), upper=None if loss == "rmse" else _root(estimate),
@@ -308,16 +328,14 @@ class Doubt:
     refused: str | None
 
 
-def _doubt(delta: np.ndarray, value: np.ndarray, estimate: float, columns: np.ndarray | None) -> Doubt:
+def _doubt(delta: np.ndarray, value: np.ndarray, estimate: float, jump: float) -> Doubt:
     """How far extrapolation is to be believed: how much it takes away, how straight the line is, whether the mean may jump."""
     removed = 1.0 - estimate / value[0] if value[0] > 0 else 1.0
     if removed > MOST_REMOVED:
         return Doubt(0.0, TOO_FAR.format(100 * min(1.0, removed)))
-    jump = 0.0 if columns is None else _jump(delta, columns)
     if jump > CURVED * estimate:
         return Doubt(0.0, A_JUMP.format(100 * jump / estimate))
-    others = [float(_line(delta[:n], value[:n])[0] @ value[:n]) for n in (FEWER, MORE)]
-    bent = max(abs(other - estimate) for other in others)
+    bent = abs(float(_line(delta[:FEWER], value[:FEWER])[0] @ value[:FEWER]) - estimate)
     return Doubt(max(bent, SHARE_IN_DOUBT * abs(value[0] - estimate)), None)
 
 

@@ -116,39 +116,44 @@ def episode_part(of_episode: np.ndarray, weights: np.ndarray, *, level: float = 
     if episodes < FEWEST:
         return EpisodePart(value, se, None, None)
     if FEWEST_RESAMPLED <= episodes <= MOST_RESAMPLED:
-        low, high = _resampled_t(off, weights, level) if se > 0 else (0.0, 0.0)
+        low, high = _ends(resampled_t(off, weights), level) if se > 0 else (0.0, 0.0)
         return EpisodePart(value, se, (se * high, -se * low), "bootstrap-t")
     quantile = t_quantile((1 + level) / 2, episodes - 1)
     return EpisodePart(value, se, (se * quantile, se * quantile), "t")
 
 
-def _resampled_t(off: np.ndarray, weights: np.ndarray, level: float) -> tuple[float, float]:
-    """The lower and upper quantile of t over resamples of episodes; `off` [E] is what each is above the weighted mean.
+def resampled_t(off: np.ndarray, weights: np.ndarray, resamples: int = RESAMPLES) -> np.ndarray:
+    """[B] t of resamples of episodes, ascending; `off` [E] is what each episode is above the weighted mean.
 
     All sums of a resample are one row of a matrix product. Where a resample has no variance (it drew equal episodes only)
-    its t is without bounds; the t distribution of two values, the widest there is, stands in as the limit.
+    its t is without bounds; the 97.5 % quantile of t of two values, the widest there is, stands in as the limit.
     """
     episodes = len(off)
     off = off / np.abs(off).max()
     heavy = weights**2
     columns = np.stack([weights, weights * off, heavy, heavy * off, heavy * off**2], axis=1)
-    total, moved, squares, cross, spread = (_resamples(episodes) @ columns / episodes).T
+    total, moved, squares, cross, spread = (_resamples(episodes, resamples) @ columns / episodes).T
     mean = moved / np.maximum(total, 1e-300)
     variance = (spread - 2 * mean * cross + mean**2 * squares) / np.maximum(total, 1e-300) ** 2 / (episodes - 1)
     has_variance = variance > 1e-14
-    limit = t_quantile((1 + level) / 2, 1)
+    limit = t_quantile(0.975, 1)
     t = np.sign(mean) * limit * (np.abs(mean) > 1e-12)
     t[has_variance] = np.clip(mean[has_variance] / np.sqrt(variance[has_variance]), -limit, limit)
-    tail = max(1, round((RESAMPLES + 1) * (1 - level) / 2))
     t.sort()
+    return t
+
+
+def _ends(t: np.ndarray, level: float) -> tuple[float, float]:
+    """The lower and upper quantile that leave a share of 1 − level outside."""
+    tail = max(1, round((len(t) + 1) * (1 - level) / 2))
     return min(0.0, float(t[tail - 1])), max(0.0, float(t[-tail]))
 
 
 @lru_cache(maxsize=4)
-def _resamples(episodes: int) -> np.ndarray:
+def _resamples(episodes: int, resamples: int) -> np.ndarray:
     """[B, E] how often each resample drew each episode; the same for everybody, so that numbers repeat."""
     generator = np.random.default_rng(episodes)
-    counts = generator.multinomial(episodes, np.full(episodes, 1 / episodes), size=RESAMPLES).astype(np.float64)
+    counts = generator.multinomial(episodes, np.full(episodes, 1 / episodes), size=resamples).astype(np.float64)
     counts.flags.writeable = False
     return counts
 

@@ -133,7 +133,7 @@ def test_a_floor_that_a_policy_is_below_is_refused():
 
 
 def test_a_sensor_is_worth_what_it_reveals():
-    demos, mean = task()
+    demos, _ = task()
     floors = [*floors_of(demos, (STATE,), "position"), *floors_of(demos)]
     sights = {"position": POSITION, "pose": POSE}
     (found,) = value_of_sensors(floors, sights, [])
@@ -150,7 +150,7 @@ def test_where_the_larger_floor_is_refused_a_policy_still_bounds_the_worth():
     brackets = form_brackets([large], [scored("perfect", demos, mean)], sights)
     (found,) = value_of_sensors([small, large], sights, brackets)
     assert found["value"] is None
-    assert found["at_least"] == pytest.approx(small.interval[0] - brackets[0]["upper"])
+    assert found["at_least"] == pytest.approx(small.interval[0] - brackets[0]["upper_interval"][1])
     (unknown,) = value_of_sensors([replace(small, value=None, interval=None), large], sights, brackets)
     assert unknown["words"].startswith("not known")
 

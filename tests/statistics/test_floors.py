@@ -57,7 +57,7 @@ def slow_gamma(demos, nearest=10):
         for rank, (distance, neighbour) in enumerate(sorted(best)[:nearest]):
             delta[frame, rank] = distance
             gamma[frame, rank] = 0.5 * ((action[frame] - action[neighbour]) ** 2).mean()
-    slope, intercept = np.polyfit(delta.mean(axis=0), gamma.mean(axis=0), 1)
+    _, intercept = np.polyfit(delta.mean(axis=0), gamma.mean(axis=0), 1)
     return intercept
 
 

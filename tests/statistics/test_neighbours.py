@@ -1,5 +1,7 @@
 """The search for neighbours: against a slow one, with hypothesis."""
 
+from itertools import pairwise
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,8 +19,8 @@ def slow(inputs, starts, scored, first, horizon, keep):
             continue
         best = []
         for episode in range(len(starts) - 1):
-            frames = [f for f in range(starts[episode] + first, starts[episode + 1] - horizon)]
-            if episode == own or not frames:
+            frames = range(starts[episode] + first, starts[episode + 1] - horizon)
+            if episode == own or not len(frames):
                 continue
             distances = [float(((inputs[frame].astype(float) - inputs[f]) ** 2).sum()) for f in frames]
             best.append((min(distances), frames[int(np.argmin(distances))]))
@@ -38,7 +40,7 @@ def slow(inputs, starts, scored, first, horizon, keep):
 def test_it_finds_what_the_slow_search_finds(lengths, columns, first, horizon, keep, seed):
     starts = np.concatenate([[0], np.cumsum(lengths)])
     inputs = np.random.default_rng(seed).normal(size=(starts[-1], columns)).astype(np.float32)
-    scored = np.concatenate([np.arange(a + first, b) for a, b in zip(starts[:-1], starts[1:], strict=True)])
+    scored = np.concatenate([np.arange(a + first, b) for a, b in pairwise(starts)])
     found = find_neighbours(inputs, starts, scored, first, [0, horizon], keep=keep)[horizon]
     expected = slow(inputs, starts, scored, first, horizon, keep)
     assert found.scored.tolist() == [frame for frame, _ in expected]
