@@ -38,8 +38,8 @@ SURE, POWER = 0.05, 0.80
 ENUMERATED = 14
 """Up to this many episodes every pattern of signs is tried."""
 FLIPS = 20_000
-RESAMPLES_HERE, MOST_RESAMPLED_HERE = 9_999, 500
-"""More than an interval takes: a family of many comparisons asks for small p. Above so many episodes skewness hardly matters."""
+RESAMPLES_HERE, MOST_RESAMPLED_HERE = 2 * FLIPS + 1, 500
+"""So many that the smallest p is that of flipping signs. Above so many episodes skewness hardly matters."""
 MOST_FLIPPED = 1_000
 """Above this many episodes the sum of flipped signs is normal for all purposes."""
 MOST_EPISODES, MOST_SEEDS = 100_000, 1_000
@@ -158,7 +158,9 @@ def compare_paired(
     )
     if not tested:
         return found
-    p = max(sign_flip(weights * difference), _t_p(found), _bootstrap_p(part, difference, weights))
+    p = max(sign_flip(weights * difference), _t_p(found))
+    if p <= SURE:  # it can only grow, so where nothing shows already there is nothing to resample
+        p = max(p, _bootstrap_p(part, difference, weights))
     return replace(found, p=p, smallest_seen=_reach(found, SURE, POWER))
 
 

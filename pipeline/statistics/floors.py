@@ -55,8 +55,8 @@ TOO_FAR = (
     "the nearest states differ too much: extrapolation to distance zero would take away {:.0f} % of what they show"
 )
 A_JUMP = (
-    "the mean action may jump from state to state (a gripper that closes): a jump would account for {:.0f} % of the estimate, "
-    "and the data cannot tell"
+    "the mean action may jump from state to state (a gripper that closes): a jump could make up {} of the estimate, and the "
+    "data cannot tell"
 )
 NOTHING: dict[str, None] = {"value": None, "upper": None, "interval": None}
 
@@ -334,7 +334,7 @@ def _doubt(delta: np.ndarray, value: np.ndarray, estimate: float, jump: float) -
     if removed > MOST_REMOVED:
         return Doubt(0.0, TOO_FAR.format(100 * min(1.0, removed)))
     if jump > CURVED * estimate:
-        return Doubt(0.0, A_JUMP.format(100 * jump / estimate))
+        return Doubt(0.0, A_JUMP.format(f"{100 * jump / estimate:.0f} %" if jump < estimate else "all"))
     bent = abs(float(_line(delta[:FEWER], value[:FEWER])[0] @ value[:FEWER]) - estimate)
     return Doubt(max(bent, SHARE_IN_DOUBT * abs(value[0] - estimate)), None)
 

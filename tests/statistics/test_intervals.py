@@ -32,7 +32,7 @@ def slow_bootstrap_t(values: np.ndarray, counts: np.ndarray) -> tuple[float, flo
 
     centre, error = centre_and_error(values, counts)
     found = []
-    for drawn in _resamples(len(values)).astype(int):
+    for drawn in _resamples(len(values), RESAMPLES).astype(int):
         episodes = np.repeat(np.arange(len(values)), drawn)
         again, its_error = centre_and_error(values[episodes], counts[episodes])
         found.append((again - centre) / its_error)
