@@ -119,7 +119,8 @@ class Plan:
         """Learning curves and every result that they are made from, inputs first."""
         predictions = [u for curve in curves for u in self.inputs(curve) if u.kind == "predictions"]
         trained = [u for p in predictions for u in self.inputs(p)]
-        return [*(Unit(asset) for asset in DATA), *trained, *predictions, *curves]
+        needed = [Unit(asset) for asset in DATA if asset != "action_modes"]
+        return [*needed, *trained, *predictions, *curves]
 
     def stale(self, units: Sequence[Unit] | None = None) -> dict[Unit, str]:
         """Every result of the selection (or of `units`) that must be made again, and why, in the order of the work."""
