@@ -132,9 +132,8 @@ def _show(found: Mapping[str, Any], folder: Path, console: Console) -> None:
     for answer in found["answers"]:
         console.print(f"[{colours[answer['word']]}]{escape(answer['words'])}[/]", soft_wrap=True)
     if found["floor"] is None:
-        console.print(
-            "[dim]No floor is known for the first-step error: none was measured, or its estimator refused (demobench floor says why).[/]"
-        )
+        words = "No floor is known for the first-step error: none was measured, or its estimator refused"
+        console.print(f"[dim]{words} (demobench floor says why).[/]", soft_wrap=True)
     for path in found["pictures"]:
         console.print(f"  Picture  {escape(short(path))}", soft_wrap=True)
 
