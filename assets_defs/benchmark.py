@@ -8,9 +8,10 @@ from pathlib import Path
 import dagster as dg
 
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
+from assets_defs.floor import ESTIMATES
 from assets_defs.plan import Unit
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
-from assets_defs.show import picture, present, table
+from assets_defs.show import interval_words, picture, present, table
 
 TABLE = dg.AssetKey(["benchmark_table"])
 REPORT = dg.AssetKey(["benchmark_report"])
@@ -83,7 +84,7 @@ def _write_table(bench: Bench, draft) -> Outcome:
             }
         )
     floor = plan.folder(Unit("multimodality_floor"))
-    floors, estimates = load_floors(floor / "radius.json"), load_estimates(floor / "estimates.json")
+    floors, estimates = load_floors(floor / "radius.json"), load_estimates(floor / ESTIMATES)
     facts = bench.summary(Unit("demonstrations"))["inspect"]
     modes = json.loads((plan.folder(Unit("action_modes")) / "modes.json").read_text(encoding="utf-8"))
     built = build_table(facts, bench.experiment, bench.split, floors, estimates, entries, modes)
@@ -93,7 +94,7 @@ def _write_table(bench: Bench, draft) -> Outcome:
             row["policy"],
             row["observations"],
             row["first_step_mae"],
-            _words(row["interval"].get("first_step_mae")),
+            interval_words(row["interval"].get("first_step_mae")),
             row["vs_hold_still"],
             row["rollouts"]["success"] if row["rollouts"] else None,
         )
@@ -129,10 +130,6 @@ def project_version() -> str:
         ["git", "describe", "--always", "--dirty"], cwd=here, capture_output=True, text=True, check=False
     )
     return f"{version('demobench')} ({asked.stdout.strip()})" if asked.returncode == 0 else version("demobench")
-
-
-def _words(interval: Sequence[float] | None) -> str | None:
-    return f"{interval[0]:.4g} … {interval[1]:.4g}" if interval else None
 
 
 def _benchmark_report(benchmark_table: dg.AssetsDefinition) -> dg.AssetsDefinition:

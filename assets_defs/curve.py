@@ -9,7 +9,7 @@ import dagster as dg
 from pydantic import Field
 
 from assets_defs.data import PARTITIONS, episode_split
-from assets_defs.floor import multimodality_floor
+from assets_defs.floor import ESTIMATES, multimodality_floor
 from assets_defs.plan import CODE_VERSIONS, Plan, Unit, curve_unit, sizes_of
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import picture, present, table
@@ -18,8 +18,6 @@ from pipeline.errors import ConfigError, did_you_mean
 from pipeline.experiment import Experiment, Variant
 
 KEY = dg.AssetKey(["learning_curve"])
-ESTIMATES = "estimates.json"
-"""Where the asset `multimodality_floor` keeps the floors of each loss."""
 
 
 class CurveConfig(dg.Config):

@@ -7,10 +7,12 @@ import dagster as dg
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
 from assets_defs.plan import FLOOR, Unit
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
-from assets_defs.show import picture, present, table
+from assets_defs.show import interval_words, picture, present, table
 
 KEY = dg.AssetKey(["multimodality_floor"])
 MODES = dg.AssetKey(["action_modes"])
+ESTIMATES = "estimates.json"
+"""Where the asset `multimodality_floor` keeps the floors of each loss."""
 
 
 @dg.asset(
@@ -64,7 +66,7 @@ def _measure(bench: Bench, draft: Path) -> Outcome:
     for done, s in enumerate(sets):
         bench.progress("floors", done, len(sets), s.name)
         estimates += measure_floors(demos, semantics, s, bench.split, history=history, horizons=horizons)
-    save_estimates(estimates, draft / "estimates.json")
+    save_estimates(estimates, draft / ESTIMATES)
     rows = [(f.observations, f.radius, f.probes, f.median_neighbours, f.mean, f.p90, f.unit, f.refused) for f in floors]
     sound = all(f.refused or (f.mean == f.mean and f.mean >= 0) for f in floors)
     sound &= all((e.value is None) != (e.refused is None) for e in estimates)
@@ -73,16 +75,12 @@ def _measure(bench: Bench, draft: Path) -> Outcome:
         {
             "rows": [[None if v != v else v for v in row] for row in rows],
             "estimates": [
-                (e.observations, e.horizon, e.loss, e.value, e.upper or e.below, _words(e.interval), e.refused)
+                (e.observations, e.horizon, e.loss, e.value, e.upper or e.below, interval_words(e.interval), e.refused)
                 for e in estimates
             ],
         },
         {"answered_or_refused": (sound, f"{answered} of {len(estimates)} floors have a value; the rest say why not")},
     )
-
-
-def _words(interval: tuple[float, float] | None) -> str | None:
-    return f"{interval[0]:.4g} … {interval[1]:.4g}" if interval else None
 
 
 @dg.asset(

@@ -35,7 +35,8 @@ CODE_VERSIONS = {
 }
 """Raised by hand when what an asset computes changes: everything downstream becomes stale."""
 
-DATA = ("demonstrations", "episode_split", "windows", "multimodality_floor", "action_modes")
+DATA = ("demonstrations", "episode_split", "windows", "multimodality_floor")
+MODES = ("action_modes",)
 SUMMARIES = ("benchmark_table", "benchmark_report", "mcap_log", "rerun_recording")
 POLICY = ("trained_policy", "predictions", "rollouts")
 
@@ -99,7 +100,7 @@ class Plan:
         """Every result of the selection, inputs before what is made from them."""
         variants = [v for v in self.variants if not self.selected or v.name in self.selected]
         policies = [u for kind in POLICY for v in variants for u in self.selected_units(v, kind)]
-        return [Unit(asset) for asset in DATA] + policies + [Unit(asset) for asset in SUMMARIES]
+        return [Unit(asset) for asset in (*DATA, *MODES)] + policies + [Unit(asset) for asset in SUMMARIES]
 
     def fingerprint(self, unit: Unit) -> str | None:
         """What the result's fingerprint would be now; None while something it is made from is not there or stale."""
@@ -119,8 +120,7 @@ class Plan:
         """Learning curves and every result that they are made from, inputs first."""
         predictions = [u for curve in curves for u in self.inputs(curve) if u.kind == "predictions"]
         trained = [u for p in predictions for u in self.inputs(p)]
-        needed = [Unit(asset) for asset in DATA if asset != "action_modes"]
-        return [*needed, *trained, *predictions, *curves]
+        return [*(Unit(asset) for asset in DATA), *trained, *predictions, *curves]
 
     def stale(self, units: Sequence[Unit] | None = None) -> dict[Unit, str]:
         """Every result of the selection (or of `units`) that must be made again, and why, in the order of the work."""
@@ -207,17 +207,10 @@ class Plan:
                 return _dump(e, fields) | {"has_simulator": e.dataset.simulator is not None}
             case "windows":
                 return _dump(e, {"protocol", "history"}) | {"largest_chunk": e.largest_chunk}
-            case "multimodality_floor":
-                settings = {
-                    "floor": FLOOR,
-                    "observations": e.dataset.observations,
-                    "horizons": e.dataset.floor_horizons,
-                }
-                return settings | _dump(e, {"history"})
-            case "action_modes":
-                return {"observations": e.dataset.observations, "horizons": e.dataset.floor_horizons} | _dump(
-                    e, {"history"}
-                )
+            case "multimodality_floor" | "action_modes":
+                floor = {"floor": FLOOR} if unit.kind == "multimodality_floor" else {}
+                asked = {"observations": e.dataset.observations, "horizons": e.dataset.floor_horizons}
+                return floor | asked | _dump(e, {"history"})
             case "trained_policy":
                 variant = self._variant_named[unit.asset.split("/")[0]]
                 settings = {"method": variant.method, "chunk": variant.chunk, "windows": CODE_VERSIONS["windows"]}

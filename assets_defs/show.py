@@ -38,3 +38,8 @@ def picture(path: Path) -> dg.MarkdownMetadataValue | None:
 def present(metadata: dict[str, Any]) -> dict[str, Any]:
     """Metadata without the entries that have no value."""
     return {name: value for name, value in metadata.items() if value is not None}
+
+
+def interval_words(interval: Sequence[float] | None) -> str | None:
+    """An interval as a table's cell."""
+    return f"{interval[0]:.4g} … {interval[1]:.4g}" if interval else None

@@ -10,23 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from demobench.commands import Session, check_source, materialise, open_session, short, write_json_to
-from pipeline.errors import ConfigError
-from pipeline.experiment import Choices, Target, parse_list, resolve_target
-
-
-def parse_sizes(text: str | None) -> tuple[int, ...]:
-    """`"10,20"` → `(10, 20)`.
-
-    Raises:
-        ConfigError: something is not a whole number of at least 1.
-    """
-    try:
-        sizes = tuple(int(part) for part in parse_list(text))
-    except ValueError:
-        sizes = (0,)
-    if any(size < 1 for size in sizes):
-        raise ConfigError(f"--sizes takes whole numbers of at least 1, separated by commas, not '{text}'.")
-    return sizes
+from pipeline.experiment import Choices, Target, parse_list, parse_sizes, resolve_target
 
 
 def run_curve(
@@ -81,18 +65,16 @@ def _check_sizes(target: Target, plan: Any, session: Session, asked: Sequence[in
     """Fail before any training where there are too few episodes, or too few for the sizes asked for."""
     from assets_defs.plan import Unit
     from pipeline.curve import curve_sizes
+    from pipeline.folds import split_of
     from pipeline.lerobot_format.read import load_source
-    from pipeline.split import load_split, make_split
+    from pipeline.split import load_split
 
     e = target.experiment
     if plan.is_fresh(Unit("episode_split")):
         split = load_split(plan.folder(Unit("episode_split")) / "split.json")
     else:
         demos = load_source(e.dataset.source, name=e.name, config_dir=session.config_dir)
-        split = make_split(
-            demos, protocol=e.protocol, folds=e.folds, test_share=e.test_share, seed=e.split_seed,
-            has_simulator=e.dataset.simulator is not None,
-        )  # fmt: skip
+        split = split_of(e, demos)
     curve_sizes(split, asked)
 
 

@@ -357,6 +357,11 @@ def parse_horizons(text: str | None) -> tuple[int, ...]:
     return _parse_numbers("--horizons", text, 0)
 
 
+def parse_sizes(text: str | None) -> tuple[int, ...]:
+    """`"10,20"` → `(10, 20)`; a ConfigError where something is not a whole number of at least 1."""
+    return _parse_numbers("--sizes", text, 1)
+
+
 def _parse_numbers(option: str, text: str | None, least: int) -> tuple[int, ...]:
     try:
         numbers = tuple(int(part) for part in parse_list(text))
