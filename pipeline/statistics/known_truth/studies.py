@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 
 from pipeline.split import make_split
+from pipeline.statistics.brackets import Scored, Sight, gap_to_floor, value_of_sensors
 from pipeline.statistics.comparisons import compare_paired, judge
 from pipeline.statistics.floors import measure_floors
 from pipeline.statistics.intervals import estimate_mean
-from pipeline.statistics.known_truth.generators import GENERATORS, Truth
+from pipeline.statistics.known_truth.generators import GENERATORS, Generator, States, Truth
 from pipeline.statistics.radius import radius_floor
-from pipeline.types import ACTION, STATE, Demonstrations, Split
+from pipeline.types import ACTION, STATE, Demonstrations, EpisodeErrors, FloorEstimate, Split
 
 Record = dict[str, Any]
+Columns = dict[str, list[float | None]]
 SCALES = {"rmse": "mse", "mae": "mae", "l2": "l2"}
 """The loss of an estimate → the floor it is held against; rmse is the root of it."""
 
@@ -27,33 +29,77 @@ SCALES = {"rmse": "mse", "mae": "mae", "l2": "l2"}
 # Floors ---------------------------------------------------------------------------------------------------------------
 
 
+OFF = {"best": 0.0, "off": 0.5}
+"""Two policies of known error: the mean of the demonstrator, and so many deviations of its noise beside it."""
+
+
 def study_floors(
     *,
     repeats: Sequence[int],
     generator: str,
     episodes: int,
-    measure: Callable[..., Sequence[Any]] = measure_floors,
+    measure: Callable[..., Sequence[FloorEstimate]] = measure_floors,
     radius: Callable[..., Any] | None = radius_floor,
+    gap: Callable[..., Any] = gap_to_floor,
+    worth: Callable[..., Sequence[Mapping[str, Any]]] = value_of_sensors,
 ) -> Record:
-    """Every floor of every observation set of a generator, beside its truth; `radius` None: without the notebook's."""
+    """Floors of every observation set of a generator, what lies between them and two policies, what seeing more is worth.
+
+    `radius` None: without the notebook's.
+    """
     made = GENERATORS[generator]
-    names = ("value", "upper", "low", "high", "below")
-    columns: dict[str, list[float | None]] = {}
+    columns: Columns = {}
     for repeat in repeats:
         truth = made.build(episodes, repeat)
         split = split_of(truth, repeat)
+        floors: list[FloorEstimate] = []
         for observations in truth.sets:
             found = measure(truth.demos, truth.semantics, observations, split, history=truth.history, horizons=[0])
+            floors += found
             for estimate in found:
-                low, high = estimate.interval or (None, None)
-                values = (estimate.value, estimate.upper, low, high, estimate.below)
-                for name, value in zip(names, values, strict=True):
-                    columns.setdefault(f"{observations.name}/{estimate.loss}/{name}", []).append(_number(value))
+                where = f"{observations.name}/{estimate.loss}"
+                _write(columns, where, value=estimate.value, upper=estimate.upper, below=estimate.below)
+                _write(columns, where, **_ends(estimate.interval))
             if radius is not None and observations.history == 1:
-                found = radius(truth.demos, truth.semantics, observations, probes=200)
-                columns.setdefault(f"{observations.name}/radius/value", []).append(_number(found.mean))
-    floors = {f"{name}/{loss}": value for (name, _, loss), value in truth.floors.items()}
-    return {"truth": floors, "columns": columns}
+                _write(
+                    columns,
+                    f"{observations.name}/radius",
+                    value=radius(truth.demos, truth.semantics, observations, probes=200).mean,
+                )
+        _write_gaps(columns, made, truth, floors[0], gap)
+        if len(truth.sets) > 1:
+            sights = {each.name: Sight(frozenset(each.features), each.history) for each in truth.sets}
+            (found,) = worth(floors, sights, ())
+            _write(columns, "worth", value=found["value"], **_ends(found["interval"]))
+    known = {f"{name}/{loss}": value for (name, _, loss), value in truth.floors.items()}
+    return {"truth": known, "columns": columns}
+
+
+def _write_gaps(columns: Columns, made: Generator, truth: Truth, floor: FloorEstimate, gap: Callable[..., Any]) -> None:
+    """The distance of each policy of OFF from the squared floor of the smallest set, whose mean the generator knows."""
+    demos = truth.demos
+    states = States(demos.columns[STATE].astype(np.float64), demos.lengths, np.zeros(demos.episodes))
+    best, deviation = made.mean(states), np.sqrt(truth.floors[floor.observations, 0, "mse"])
+    for name, off in OFF.items():
+        found = gap(_scored(truth, best + off * deviation, floor.observations), floor)
+        _write(columns, f"{floor.observations}/gap_{name}", value=found.gap, **_ends(found.interval))
+
+
+def _scored(truth: Truth, predicted: np.ndarray, observations: str) -> Scored:
+    """A policy's errors at the first action of every anchor, by episode."""
+    demos = truth.demos
+    error = np.where((demos.frame_in_episode >= truth.history - 1)[:, None], predicted - demos.columns[ACTION], 0.0)
+
+    def by_episode(values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(values, demos.episode_starts[:-1])[None, :, None]
+
+    errors = EpisodeErrors(
+        episodes=np.arange(demos.episodes), fold=np.zeros(demos.episodes, int),
+        anchors=(demos.lengths - truth.history + 1)[:, None], absolute=by_episode(np.abs(error)),
+        squared=by_episode(error**2), l2=by_episode(np.linalg.norm(error, axis=1)),
+        scale=np.ones((demos.episodes, error.shape[1])),
+    )  # fmt: skip
+    return Scored("policy", observations, Sight(frozenset([STATE]), 1), errors)
 
 
 def split_of(truth: Truth, seed: int) -> Split:
@@ -85,14 +131,14 @@ def study_means(
     estimate: Callable[..., Any] = estimate_mean,
 ) -> Record:
     """The interval of a mean error, where the mean is 0. `weighted`: over frames, episodes are unevenly long."""
-    columns: dict[str, list[float | None]] = {"value": [], "low": [], "high": []}
+    columns: Columns = {}
     fold = np.arange(episodes) % folds
     for repeat in repeats:
         random = np.random.default_rng([repeat, episodes, seeds, folds])
         errors = SHAPES[shape](random, episodes) + _of_seeds(random, seeds, fold)
         counts = random.integers(20, 101, episodes) if weighted else None
         found = estimate(errors, counts, fold if folds > 1 else None)
-        _write(columns, value=found.value, low=_end(found.interval, 0), high=_end(found.interval, 1))
+        _write(columns, value=found.value, **_ends(found.interval))
     return {"truth": {"mean": 0.0}, "columns": columns}
 
 
@@ -106,7 +152,7 @@ def study_differences(
     compare: Callable[..., Any] = compare_paired,
 ) -> Record:
     """The interval and the p-value of a difference that is 0 on average; both policies find the same episodes hard."""
-    columns: dict[str, list[float | None]] = {"value": [], "low": [], "high": [], "p": []}
+    columns: Columns = {}
     fold = np.arange(episodes) % folds
     for repeat in repeats:
         random = np.random.default_rng([repeat, episodes, seeds, folds, 1])
@@ -115,8 +161,7 @@ def study_differences(
         a = hard + own + _of_seeds(random, seeds, fold)
         b = hard + _of_seeds(random, seeds, fold)
         found = compare(a, b, fold=fold if folds > 1 else None)
-        ends = {"low": _end(found.interval, 0), "high": _end(found.interval, 1)}
-        _write(columns, value=found.difference, p=found.p, **ends)
+        _write(columns, value=found.difference, p=found.p, **_ends(found.interval))
     return {"truth": {"difference": 0.0}, "columns": columns}
 
 
@@ -133,7 +178,7 @@ def study_family(
     verdicts: Callable[..., Any] = judge,
 ) -> Record:
     """Whether any of RIVALS policies, equal on average to the champion, is called better or worse than it."""
-    columns: dict[str, list[float | None]] = {"any": []}
+    columns: Columns = {}
     for repeat in repeats:
         random = np.random.default_rng([repeat, episodes, seeds, 2])
         hard, fold = 3 * random.exponential(size=episodes), np.zeros(episodes, int)
@@ -178,7 +223,7 @@ def study_null(
     family   any of the new results is, after Holm over them
     power    the first new result with its errors raised by a fifth is called worse
     """
-    columns: dict[str, list[float | None]] = {"alarm": [], "verdict": [], "family": [], "power": []}
+    columns: Columns = {}
     for repeat in repeats:
         truth = GENERATORS[generator].build(episodes, repeat)
         random = np.random.default_rng([repeat, seeds, resampled])
@@ -257,7 +302,7 @@ def study_modes(
         from pipeline.statistics.modes import evidence_of_modes as evidence
     made = GENERATORS[generator]
     seen = next(each for each in made.sets if each.name == observations)
-    columns: dict[str, list[float | None]] = {"found": [], "gain": []}
+    columns: Columns = {}
     for repeat in repeats:
         truth = made.build(episodes, repeat)
         (found,) = evidence(truth.demos, truth.semantics, seen, history=truth.history, horizons=[0], seed=repeat)
@@ -278,7 +323,7 @@ def study_curve(*, repeats: Sequence[int], rate: float, answer: Callable[..., An
     from pipeline.statistics.curve import answer as of_project
 
     error = 0.5 + 0.5 * (np.array([*SIZES, SIZES[-1] + 50]) / SIZES[-1]) ** -rate
-    columns: dict[str, list[float | None]] = {name: [] for name in ("low", "high", "yes", "no")}
+    columns: Columns = {}
     for repeat in repeats:
         random = np.random.default_rng([repeat, round(100 * rate)])
         hard = random.gamma(4, 1 / 4, HELD_OUT)
@@ -290,8 +335,7 @@ def study_curve(*, repeats: Sequence[int], rate: float, answer: Callable[..., An
             own = 0.05 * random.normal(size=(orders, TRAINING_SEEDS, HELD_OUT))
             values.append(hard * (mean + luck + of_seeds) + own)
         found = (answer or of_project)(CurveErrors(SIZES, tuple(values), np.zeros(HELD_OUT, int)), "first_step_mae")
-        ends = {"low": _end(found.interval, 0), "high": _end(found.interval, 1)}
-        _write(columns, yes=found.word == "yes", no=found.word == "no", **ends)
+        _write(columns, yes=found.word == "yes", no=found.word == "no", **_ends(found.interval))
     return {"truth": {"gain": float(error[-2] - error[-1])}, "columns": columns}
 
 
@@ -333,13 +377,14 @@ STUDIES: Mapping[str, Callable[..., Record]] = {
 }
 
 
-def _write(columns: dict[str, list[float | None]], **values: Any) -> None:
+def _write(columns: Columns, where: str = "", **values: Any) -> None:
     for name, value in values.items():
-        columns[name].append(_number(value))
+        columns.setdefault(f"{where}/{name}" if where else name, []).append(_number(value))
 
 
-def _end(interval: tuple[float, float] | None, end: int) -> float | None:
-    return None if interval is None else interval[end]
+def _ends(interval: tuple[float, float] | None) -> dict[str, float | None]:
+    low, high = interval or (None, None)
+    return {"low": low, "high": high}
 
 
 def _number(value: Any) -> float | None:

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pipeline.statistics.brackets import gap_to_floor, value_of_sensors
 from pipeline.statistics.comparisons import compare_paired, judge
 from pipeline.statistics.curve import answer
 from pipeline.statistics.floors import measure_floors
@@ -89,6 +90,28 @@ def too_low(floor: FloorEstimate) -> FloorEstimate:
     return replace(floor, value=None, interval=None, below=0.9 * (floor.value or 0.0))
 
 
+def gap_over_frames(scored, floor):
+    found = gap_to_floor(scored, floor)
+    return found if found.interval is None else replace(found, interval=over_frames(found.gap, found.interval))
+
+
+def gap_apart(scored, floor):
+    """As if a policy's error and the floor were measured on different episodes."""
+    found = gap_to_floor(scored, floor)
+    if found.interval is None:
+        return found
+    parts = [np.ptp(x) / 2 for x in (found.error_interval, floor.interval)]
+    half = np.hypot(*parts)
+    return replace(found, interval=(found.gap - half, found.gap + half))
+
+
+def worth_over_frames(floors, sights, brackets):
+    return [
+        found | {"interval": found["interval"] and over_frames(found["value"], found["interval"])}
+        for found in value_of_sensors(floors, sights, brackets)
+    ]
+
+
 def mean_over_frames(values, counts=None, fold=None):
     found = estimate_mean(values, counts, fold)
     return replace(found, interval=over_frames(found.value, found.interval))
@@ -153,6 +176,16 @@ BROKEN = [
         "all refused",
     ),
     ("below x", "floors", 16, PLANE, {"measure": changed_floors(too_low)}, "an upper limit below the truth"),
+    ("gaps", "floors", 30, PLANE, {"gap": gap_over_frames}, "gap over frames"),
+    ("gap widths", "floors", 80, PLANE, {"gap": gap_apart}, "gap not paired"),
+    (
+        "sensors",
+        "floors",
+        30,
+        {"generator": "two_ways_round", "episodes": 50},
+        {"worth": worth_over_frames},
+        "worth over frames",
+    ),
     ("intervals", "means", 200, ONE_SEED, {"estimate": mean_over_frames}, "interval over frames"),
     ("intervals", "means", 800, DRAWN, {"estimate": mean_without_seeds}, "seeds left out of the variance"),
     ("intervals", "differences", 800, DRAWN, {"compare": compare_without_seeds}, "seeds left out of a difference"),
