@@ -1,8 +1,12 @@
-"""The methods there are: one explicit dictionary from a name to where a method lives and what a benchmark must know of it.
+"""The methods there are: from a name to where a method lives and what a benchmark must know of it.
 
 What belongs here: what may be asked about a method without importing torch. What does not: the methods (`policies`).
+
+A name is one of this project's (`mlp`), `path/to/file.py:Class` or `package.module:Class` for a class of the user's own, or
+`external` for predictions that were made elsewhere (`pipeline.external`).
 """
 
+import re
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Literal
@@ -32,15 +36,42 @@ class Method:
         return getattr(import_module(self.module), self.cls)
 
 
-METHODS: dict[str, Method] = {
-    "hold_still": Method("pipeline.policies.hold_still", "HoldStill", uses_observations=False, frames=1),
-    "mean_action": Method("pipeline.policies.mean_action", "MeanAction", uses_observations=False),
-    "constant_velocity": Method(
-        "pipeline.policies.constant_velocity", "ConstantVelocity", uses_observations=False, frames=2
-    ),
-    "nearest_neighbour": Method("pipeline.policies.nearest_neighbour", "NearestNeighbour"),
-    "mlp": Method("pipeline.policies.mlp", "Mlp", chunk="set", trained=True),
-    "notebook_pusht": Method(
-        "pipeline.policies.notebook_pusht", "NotebookPushT", chunk="one", trained=True, recipe="every_frame"
-    ),
-}
+EXTERNAL = "external"
+"""The method of predictions made elsewhere: nothing here can train it or ask it."""
+
+_OWN = re.compile(r"(?P<module>[^:]+):(?P<cls>[A-Za-z_]\w*)")
+
+
+class Methods(dict[str, Method]):
+    """This project's methods by name, and on asking for one by `where:Class` the adapter of a user's own."""
+
+    def __missing__(self, name: str) -> Method:
+        if name == EXTERNAL:
+            return Method("pipeline.external", "", chunk="set", trained=True)
+        if is_own(name):
+            return Method("pipeline.policies.own", "OwnPolicy", chunk="set", trained=True)
+        raise KeyError(name)
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or name == EXTERNAL or (isinstance(name, str) and is_own(name))
+
+
+def is_own(name: str) -> bool:
+    """Whether a method's name is the address of a user's own class."""
+    return _OWN.fullmatch(name) is not None
+
+
+METHODS = Methods(
+    {
+        "hold_still": Method("pipeline.policies.hold_still", "HoldStill", uses_observations=False, frames=1),
+        "mean_action": Method("pipeline.policies.mean_action", "MeanAction", uses_observations=False),
+        "constant_velocity": Method(
+            "pipeline.policies.constant_velocity", "ConstantVelocity", uses_observations=False, frames=2
+        ),
+        "nearest_neighbour": Method("pipeline.policies.nearest_neighbour", "NearestNeighbour"),
+        "mlp": Method("pipeline.policies.mlp", "Mlp", chunk="set", trained=True),
+        "notebook_pusht": Method(
+            "pipeline.policies.notebook_pusht", "NotebookPushT", chunk="one", trained=True, recipe="every_frame"
+        ),
+    }
+)
