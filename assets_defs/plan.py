@@ -15,7 +15,7 @@ from typing import Any
 
 from pipeline.config import hash_of
 from pipeline.experiment import Experiment, Variant
-from pipeline.methods import METHODS
+from pipeline.methods import METHODS, is_own
 from pipeline.store import Store
 
 CODE_VERSIONS = {
@@ -214,7 +214,7 @@ class Plan:
             case "trained_policy":
                 variant = self._variant_named[unit.asset.split("/")[0]]
                 settings = {"method": variant.method, "chunk": variant.chunk, "windows": CODE_VERSIONS["windows"]}
-                settings |= _dump(e, {"protocol", "history"})
+                settings |= _dump(e, {"protocol", "history"}) | _of_own_class(variant, e)
                 if _depends_on_set(variant):
                     settings["features"] = e.dataset.observations[unit.entry]
                 if variant.is_trained:
@@ -243,6 +243,16 @@ def sizes_of(curve: Unit) -> tuple[int, ...]:
 
 def _depends_on_set(variant: Variant) -> bool:
     return METHODS[variant.method].uses_observations
+
+
+def _of_own_class(variant: Variant, experiment: Experiment) -> dict[str, Any]:
+    """What a class of the user's own is made with, and the bytes of the file it is in."""
+    if not is_own(variant.method):
+        return {}
+    from pipeline.policies.own import source_hash
+
+    made_with = experiment.policies[variant.family].settings
+    return {"method": variant.method.rpartition(":")[2], "source": source_hash(variant.method), "settings": made_with}
 
 
 def _installed(simulator: str | None) -> dict[str, str | None] | None:

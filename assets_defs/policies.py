@@ -116,10 +116,14 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
     unfinished = bench.store.dataset(bench.plan.key) / ".unfinished" / bench.plan.fingerprint(unit)
     name = f"{variant.name} {unit.entry}"
     folds = train_folds(
-        task, draft, unfinished, lambda done, total, loss: bench.progress(name, done, total, f"loss {loss:.4g}")
+        task,
+        draft,
+        unfinished,
+        lambda done, total, loss: bench.progress(name, done, total, "" if np.isnan(loss) else f"loss {loss:.4g}"),
     )
-    last = float(np.mean([t.losses[:, -1].mean() for t in folds])) if variant.is_trained else None
-    if variant.is_trained:
+    known = all(t.losses.size for t in folds)
+    last = float(np.mean([t.losses[:, -1].mean() for t in folds])) if known else None
+    if known:
         picture_losses(folds[0], variant.name, _everyone(bench), draft / "losses.png")
     run_id = to_mlflow.log_training(
         _tracking(bench),
@@ -140,7 +144,7 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
         {
             "finite_losses": (
                 last is None or bool(np.isfinite(last)),
-                "nothing trained" if last is None else f"{last:.4g}",
+                "no losses are known" if last is None else f"{last:.4g}",
             )
         },
     )

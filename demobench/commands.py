@@ -22,6 +22,7 @@ from pipeline.experiment import (
     resolve_target,
     select_rows,
 )
+from pipeline.methods import METHODS, is_own
 from pipeline.store import Store, write_json
 
 
@@ -92,7 +93,7 @@ def run_benchmarks(
 
 
 def check_source(targets: Sequence[Target], session: Session) -> None:
-    """Fail before any work when a folder is not there, or is no data set."""
+    """Fail before any work when a folder is not there, or is no data set, or a policy's class cannot be had."""
     from pipeline.lerobot_format.layout import read_layout
     from pipeline.lerobot_format.read import source_stamp
 
@@ -101,6 +102,8 @@ def check_source(targets: Sequence[Target], session: Session) -> None:
         source_stamp(source, session.config_dir)
         if not source.startswith(("embedded:", "hub:")):
             read_layout(Path(source))
+        for method in {v.method for v in target.selected if is_own(v.method)}:
+            METHODS[method].load_class().check()
 
 
 def _run_one(target: Target, session: Session) -> dict[str, Any]:

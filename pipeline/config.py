@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipeline.errors import ConfigError, did_you_mean
-from pipeline.methods import METHODS
+from pipeline.methods import EXTERNAL, METHODS, is_own
 from pipeline.types import ActionKind, Protocol
 
 BUDGETS = {"quick": 600, "standard": 3_000, "thorough": 20_000}
@@ -90,10 +90,13 @@ class DatasetConfig(Settings):
 
 
 class PolicyConfig(Settings):
+    """One entry of [policies]; `settings` are what a class of the user's own is made with."""
+
     method: str
     chunks: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = ()
     observations: Literal["all"] | tuple[str, ...] = "all"
     only_when_named: bool = False
+    settings: dict[str, Any] = {}
 
 
 class ScheduleConfig(Settings):
@@ -178,9 +181,14 @@ def parse_config(raw: dict[str, Any], where: str) -> Config:
     except ValidationError as error:
         raise ConfigError(f"{where}: {_first_problem(error)}") from None
     for name, policy in config.policies.items():
-        if policy.method not in METHODS:
+        if policy.method not in METHODS or policy.method == EXTERNAL:
             raise ConfigError(
-                f"{where}: [policies.{name}] method '{policy.method}' does not exist. {did_you_mean(policy.method, METHODS)}"
+                f"{where}: [policies.{name}] method '{policy.method}' does not exist. {did_you_mean(policy.method, METHODS)} "
+                'A class of your own is named by its file or module: method = "my_policy.py:MyPolicy".'
+            )
+        if policy.settings and not is_own(policy.method):
+            raise ConfigError(
+                f"{where}: [policies.{name}] has settings, which only a class of your own takes. Remove them."
             )
     return config
 

@@ -175,6 +175,7 @@ def predict_subset(
         device=task.experiment.device,
         checkpoint=checkpoint,
         on_step=on_step,
+        settings=task.own_settings,
     )
     return predict_policy(
         trained.policy,

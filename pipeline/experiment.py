@@ -23,7 +23,7 @@ from pipeline.config import (
     hash_of,
 )
 from pipeline.errors import ConfigError, did_you_mean
-from pipeline.methods import METHODS
+from pipeline.methods import METHODS, is_own
 from pipeline.types import ObservationSet, Protocol
 
 
@@ -170,7 +170,7 @@ def _experiment(config: Config, name: str, dataset: DatasetConfig, config_dir: P
     made = Experiment(
         name=name,
         dataset=dataset.model_copy(update={"source": absolute_source(dataset.source, config_dir)}),
-        policies=dict(BASELINES) | dict(config.policies),
+        policies=dict(BASELINES) | {name: _absolute_method(p, config_dir) for name, p in config.policies.items()},
         protocol=benchmark.protocol,
         history=benchmark.history,
         seeds=benchmark.seeds,
@@ -204,6 +204,13 @@ def absolute_source(source: str, config_dir: Path) -> str:
     if source.startswith(("embedded:", "hub:")):
         return source
     return str((config_dir / Path(source).expanduser()).resolve())
+
+
+def _absolute_method(policy: PolicyConfig, config_dir: Path) -> PolicyConfig:
+    """The file of a class of the user's own, made absolute likewise."""
+    if not is_own(policy.method) or ".py:" not in policy.method:
+        return policy
+    return policy.model_copy(update={"method": str((config_dir / Path(policy.method).expanduser()).resolve())})
 
 
 @dataclass(frozen=True)

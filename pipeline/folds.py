@@ -45,6 +45,11 @@ class PolicyTask:
     def seeds(self) -> tuple[int, ...]:
         return tuple(range(self.experiment.seeds)) if self.variant.is_trained else (0,)
 
+    @property
+    def own_settings(self) -> dict[str, Any]:
+        """What a class of the user's own is made with."""
+        return self.experiment.policies[self.variant.family].settings
+
     def windows(self, episodes: Iterable[int], fold: Fold) -> Windows:
         """The anchors of some episodes, normalised by what this fold may learn from."""
         method = METHODS[self.variant.method]
@@ -100,6 +105,7 @@ def train_folds(
                 device=task.experiment.device,
                 checkpoint=unfinished / "checkpoint.safetensors",
                 on_step=report,
+                settings=task.own_settings,
             )
             draft = kept.with_name(f".{kept.name}")
             save_trained(trained, draft)

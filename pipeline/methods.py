@@ -9,7 +9,7 @@ A name is one of this project's (`mlp`), `path/to/file.py:Class` or `package.mod
 import re
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Literal
+from typing import Any, Literal
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class Method:
     uses_observations  its answer depends on the observation set; else it runs once a data set
     frames             frames of `observation.state` that a method without an observation set looks at
     recipe             which windows it is made for (`windows.Recipe`)
+    address            of a class of the user's own, which `cls` then finds
     """
 
     module: str
@@ -31,9 +32,12 @@ class Method:
     uses_observations: bool = True
     frames: int = 0
     recipe: Literal["arm", "every_frame"] = "arm"
+    address: str | None = None
 
-    def load_class(self) -> type:
-        return getattr(import_module(self.module), self.cls)
+    def load_class(self) -> Any:
+        """What has the method's `fit` and `restore`."""
+        found = getattr(import_module(self.module), self.cls)
+        return found if self.address is None else found(self.address)
 
 
 EXTERNAL = "external"
@@ -49,7 +53,7 @@ class Methods(dict[str, Method]):
         if name == EXTERNAL:
             return Method("pipeline.external", "", chunk="set", trained=True)
         if is_own(name):
-            return Method("pipeline.policies.own", "OwnPolicy", chunk="set", trained=True)
+            return Method("pipeline.policies.own", "OwnMethod", chunk="set", trained=True, address=name)
         raise KeyError(name)
 
     def __contains__(self, name: object) -> bool:

@@ -10,7 +10,7 @@ method learns (`policies`), or where folders lie (`store`).
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,7 @@ def train_policy(
     device: str = "cpu",
     checkpoint: Path | None = None,
     on_step: Callable[[int, int, float], None] | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> Trained:
     """Fit a method on the windows of training episodes, all seeds together.
 
@@ -60,6 +61,7 @@ def train_policy(
     checkpoint : a file. Training goes on from it where it belongs to the same windows and settings, and keeps it up to
         date; it stays there afterwards. The weights are the same bytes as without a break.
     on_step : called with (step, steps, mean loss of the seeds) about 200 times.
+    settings : what a class of the user's own is made with.
 
     Raises
     ------
@@ -67,7 +69,7 @@ def train_policy(
     """
     if method not in METHODS:
         raise PolicyError(f"No method '{method}'. {did_you_mean(method, METHODS)}")
-    plan = Plan(tuple(seeds), steps, threads, device, checkpoint, on_step=on_step)
+    plan = Plan(tuple(seeds), steps, threads, device, checkpoint, on_step=on_step, settings=settings or {})
     policy, curve = METHODS[method].load_class().fit(windows, plan)
     if curve is None:
         return Trained(method, policy, np.empty(0, np.int64), np.empty((1, 0), np.float32), 0.0, policy.parameters)

@@ -13,9 +13,10 @@ A policy owns its transform, and its arrays hold it. Files are written and read 
 """
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,7 @@ class Plan:
     checkpoint          a file to go on from and to keep up to date, or None
     checkpoint_every_s  seconds between two of them
     on_step             called with (step, steps, loss) now and then
+    settings            of a class of the user's own: what its `__init__` takes
     """
 
     seeds: tuple[int, ...]
@@ -41,6 +43,7 @@ class Plan:
     checkpoint: Path | None = None
     checkpoint_every_s: float = 20.0
     on_step: Callable[[int, int, float], None] | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
