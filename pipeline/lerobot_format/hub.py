@@ -4,14 +4,16 @@ What belongs here: names, the cache, the network and its failures. What does not
 Tokens stay inside `huggingface_hub`; no message here repeats what a server or a header said.
 """
 
+import hashlib
 import os
 import re
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from pipeline.errors import HubError
@@ -22,6 +24,10 @@ if TYPE_CHECKING:
 KIND = "dataset"
 TIMEOUT_S = 15.0
 """Longest wait for one answer of the Hub."""
+ATTEMPTS, FIRST_WAIT_S = 3, 1.0
+"""How often a download is begun (each goes on from what is there), and the pause after the first, which doubles."""
+PATIENCE_S = 30
+"""A Hub that asks for a longer pause (429, Retry-After) counts as out of reach."""
 
 _REPOSITORY = re.compile(r"[A-Za-z0-9_][\w.-]{0,95}/[A-Za-z0-9_][\w.-]{0,95}", re.ASCII)
 _REVISION = re.compile(r"[\w][\w./+-]{0,199}", re.ASCII)
@@ -39,7 +45,14 @@ class HubCopy:
 
 
 class _OutOfReach(Exception):
-    """The Hub gave no answer, or none but that it is broken. Never leaves this module."""
+    """The Hub gave no answer, or none but that it is broken. Never leaves this module.
+
+    `passing`: asking again soon may help.
+    """
+
+    def __init__(self, reason: str, *, passing: bool = False):
+        super().__init__(reason)
+        self.passing = passing
 
 
 def parse_repository(text: str) -> tuple[str, str | None]:
@@ -127,7 +140,33 @@ def _check_room(repository: str, size: int) -> None:
 
 
 def _download(repository: str, revision: str | None, commit: str, patterns: list[str]) -> HubCopy:
-    """Download what is not in the cache yet. The commit is the one whose files came, should a branch move meanwhile."""
+    """Download what is not in the cache yet, in a few attempts, each going on from what is there; check what came.
+
+    The commit is the one whose files came, should a branch move meanwhile: all of them are of one commit.
+    """
+    began, damaged = time.time(), []
+    for attempt in range(ATTEMPTS):
+        try:
+            copy = _download_once(repository, revision, commit, patterns)
+        except _OutOfReach as reason:
+            if not reason.passing or attempt == ATTEMPTS - 1:
+                raise
+            time.sleep(FIRST_WAIT_S * 2**attempt)
+            continue
+        damaged = [file for file in copy.folder.rglob("*") if file.is_file() and not _is_as_named(file, began)]
+        if not damaged:
+            return copy
+        for file in damaged:
+            file.resolve().unlink()
+            file.unlink()
+    name = damaged[0].relative_to(copy.folder).as_posix()
+    raise HubError(
+        f"The Hub ({_host()}) sent '{name}' of '{repository}' {ATTEMPTS} times with other bytes than its own hash of the file "
+        "says. Nothing of it was kept. Something between here and the Hub changes files; try another network, or later."
+    )
+
+
+def _download_once(repository: str, revision: str | None, commit: str, patterns: list[str]) -> HubCopy:
     from huggingface_hub import snapshot_download
 
     with _failures_of(repository, revision):
@@ -141,6 +180,21 @@ def _download(repository: str, revision: str | None, commit: str, patterns: list
             endpoint=_endpoint(),
         )
     return HubCopy(Path(folder), Path(folder).name if _COMMIT.fullmatch(Path(folder).name) else commit)
+
+
+def _is_as_named(file: Path, began: float) -> bool:
+    """Whether a file that came since `began` has the hash that the Hub gave for it, by which the cache names its bytes.
+
+    Large files go by sha256, small ones by git's own hash of a blob. `huggingface_hub` compares sizes only.
+    """
+    bytes_ = file.resolve()
+    if bytes_.stat().st_mtime < began - 1 or not re.fullmatch(r"[0-9a-f]{40}|[0-9a-f]{64}", bytes_.name):
+        return True
+    digest = hashlib.sha256() if len(bytes_.name) == 64 else hashlib.sha1(b"blob %d\0" % bytes_.stat().st_size)
+    with bytes_.open("rb") as stream:
+        while block := stream.read(2**20):
+            digest.update(block)
+    return digest.hexdigest() == bytes_.name
 
 
 def _cached(repository: str, revision: str | None, patterns: list[str], *, listed: bool) -> HubCopy | None:
@@ -181,8 +235,19 @@ def _api() -> "HfApi":
     """The client, with an end to every wait: the library's own session would wait for ever."""
     from huggingface_hub import HfApi, get_session
 
-    get_session().timeout = TIMEOUT_S
+    session = get_session()
+    session.timeout = TIMEOUT_S
+    if _give_up_on_long_pauses not in session.event_hooks["response"]:
+        hooks = session.event_hooks
+        session.event_hooks = {**hooks, "response": [*hooks["response"], _give_up_on_long_pauses]}
     return HfApi(endpoint=_endpoint())
+
+
+def _give_up_on_long_pauses(response: Any) -> None:
+    """The library waits as long as Retry-After says, be it an hour, and asks five times."""
+    asked = response.headers.get("retry-after", "")
+    if response.status_code == 429 and asked.isdigit() and int(asked) > PATIENCE_S:
+        raise _OutOfReach(f"it asks for a pause of {int(asked):,} s")
 
 
 @contextmanager
@@ -209,18 +274,25 @@ def _failures_of(repository: str, revision: str | None) -> Iterator[None]:
             f"'{repository}' has no revision '{revision or 'main'}' on the Hub ({_host()}). Give a branch, a tag or a "
             f"commit that it has, or leave @revision out."
         ) from None
+    except errors.RemoteEntryNotFoundError:
+        raise HubError(
+            f"The Hub ({_host()}) lists a file of '{repository}' that it does not have. Give another revision, or ask whoever "
+            "keeps the data set to upload it again."
+        ) from None
     except errors.HfHubHTTPError as error:
         status = error.response.status_code
         if status >= 500 or status in (408, 429):
-            raise _OutOfReach(f"it answered {status}") from None
+            raise _OutOfReach(f"it answered {status}", passing=True) from None
         raise HubError(
             f"The Hub ({_host()}) refused '{repository}' with status {status}. Run `hf auth login`."
         ) from None
     except (errors.OfflineModeIsEnabled, errors.IncompleteSnapshotError, errors.LocalEntryNotFoundError) as error:
         raise _OutOfReach(type(error).__name__) from None
     except (errors.HTTPError, errors.FileMetadataError, errors.XetDownloadError) as error:
-        raise _OutOfReach(type(error).__name__) from None
+        raise _OutOfReach(type(error).__name__, passing="Timeout" in type(error).__name__) from None
     except OSError as error:
+        if error.errno is None:  # the library's own check of sizes
+            raise _OutOfReach("it sent a part of a file", passing=True) from None
         raise HubError(
             f"'{repository}' cannot be kept in {_cache_folder()}: {error.strerror or type(error).__name__}. "
             "Make room, or set HF_HOME to another folder."

@@ -7,7 +7,8 @@ comes in pages, refusals carry X-Error-Code. It counts what it was asked.
 import hashlib
 import json
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -32,6 +33,26 @@ class Repository:
 
 
 @dataclass
+class Fault:
+    """Something that goes wrong, once, with the next request whose path contains `where`.
+
+    status and headers  answered instead of what was asked for
+    cut                 the body ends after so many bytes, and the connection with it
+    change              the body is what this makes of it, its length unchanged
+    stall_s             seconds before anything is sent
+    then                called before the answer is made
+    """
+
+    where: str
+    status: int | None = None
+    headers: dict[str, str] = field(default_factory=dict)
+    cut: int | None = None
+    change: Callable[[bytes], bytes] | None = None
+    stall_s: float = 0.0
+    then: Callable[[], Any] | None = None
+
+
+@dataclass
 class Hub:
     """What the server holds, and what it has seen: `asked` lists "METHOD path", `tokens` the authorisation headers."""
 
@@ -39,6 +60,7 @@ class Hub:
     asked: list[str] = field(default_factory=list)
     tokens: list[str] = field(default_factory=list)
     failure: int | None = None
+    faults: list["Fault"] = field(default_factory=list)
     url: str = ""
     storage_url: str = ""
 
@@ -88,6 +110,7 @@ def running_hub() -> Iterator[Hub]:
 
 class _Handler(BaseHTTPRequestHandler):
     hub: Hub
+    fault: Fault | None = None
     protocol_version = "HTTP/1.1"
 
     def log_message(self, *_: Any) -> None:
@@ -107,6 +130,15 @@ class _Handler(BaseHTTPRequestHandler):
         if self.hub.failure:
             self._refuse(self.hub.failure, None)
             return
+        self.fault = next((f for f in self.hub.faults if f.where in f"{self.command} {url.path}"), None)
+        if self.fault is not None:
+            self.hub.faults.remove(self.fault)
+            time.sleep(self.fault.stall_s)
+            if self.fault.then:
+                self.fault.then()
+            if self.fault.status:
+                self._refuse(self.fault.status, None, self.fault.headers)
+                return
         parts = [unquote(part) for part in url.path.strip("/").split("/")]
         if parts[0] == "blobs":
             self._blob(parts[1])
@@ -179,9 +211,19 @@ class _Handler(BaseHTTPRequestHandler):
             for files in repository.commits.values():
                 for content in files.values():
                     if hashlib.sha256(content).hexdigest() == sha256:
-                        self._send(200, content, {"ETag": f'"{sha256}"'})
+                        self._part(content, {"ETag": f'"{sha256}"'})
                         return
         self._refuse(404, "EntryNotFound")
+
+    def _part(self, content: bytes, headers: dict[str, str]) -> None:
+        """The whole, or what lies after the first byte that is asked for."""
+        asked = self.headers.get("range", "")
+        if not asked.startswith("bytes="):
+            self._send(200, content, headers)
+            return
+        start = int(asked.removeprefix("bytes=").split("-")[0])
+        place = {"Content-Range": f"bytes {start}-{len(content) - 1}/{len(content)}"}
+        self._send(206, content[start:], headers | place)
 
     def _refuse(self, status: int, code: str | None, headers: dict[str, str] | None = None) -> None:
         self._send(status, b'{"error":"no"}', (headers or {}) | ({"X-Error-Code": code} if code else {}))
@@ -195,8 +237,15 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header(key, value)
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()
-        if self.command == "GET":
-            self.wfile.write(content)
+        if self.command != "GET":
+            return
+        fault = self.fault
+        if fault and fault.change:
+            content = fault.change(content)
+        if fault and fault.cut is not None:
+            content = content[: fault.cut]
+            self.close_connection = True
+        self.wfile.write(content)
 
 
 def _sizes(content: bytes) -> dict[str, Any]:

@@ -1,11 +1,15 @@
 """Fetching from the Hub, against a small server on 127.0.0.1 that speaks its interface."""
 
+import os
 import shutil
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import huggingface_hub
 import pytest
 
 from pipeline.errors import DatasetError, HubError
@@ -14,7 +18,7 @@ from pipeline.lerobot_format.hub import current_commit, fetch, parse_repository
 from pipeline.lerobot_format.read import load_source, read_dataset, source_stamp
 from tests.makers import tiny_recording, write_v2, write_v3
 
-from .hub_server import Hub, running_hub
+from .hub_server import Fault, Hub, running_hub
 
 NAME = "owner/tiny"
 
@@ -256,3 +260,133 @@ def test_an_endpoint_that_is_no_address(hub: Hub, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(HubError, match="HF_ENDPOINT is not the address of a Hub") as caught:
         fetch(NAME)
     assert "hunter2" not in str(caught.value)
+
+
+# What goes wrong on the way -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hub_module, "FIRST_WAIT_S", 0.01)
+
+
+def test_a_file_that_breaks_off_is_resumed_where_it_did(hub: Hub, folder: Path, no_pause):
+    hub.push(NAME, folder)
+    hub.faults.append(Fault("GET /blobs", cut=700))
+    expected = read_dataset(folder, name="tiny").content_hash
+    assert load(f"hub:{NAME}").content_hash == expected
+    assert not hub.faults
+    assert sum("GET /blobs" in line for line in hub.asked) == 1 + len(
+        {line for line in hub.asked if "GET /blobs" in line}
+    )
+
+
+@pytest.mark.parametrize("status", [500, 502, 408])
+def test_a_server_that_stumbles_is_asked_again(hub: Hub, folder: Path, no_pause, status: int):
+    hub.push(NAME, folder)
+    hub.faults += [Fault("GET /blobs", status=status), Fault("GET /datasets", status=status)]
+    assert load(f"hub:{NAME}").episodes == 6
+    assert not hub.faults
+
+
+def test_a_server_that_stays_broken_is_given_up_and_nothing_is_taken_for_a_copy(hub: Hub, folder: Path, no_pause):
+    hub.push(NAME, folder)
+    hub.faults += [Fault("GET /blobs", status=500) for _ in range(50)]
+    with pytest.raises(HubError, match=r"out of reach \(it answered 500\), and there is no whole copy"):
+        load(f"hub:{NAME}")
+    assert len(hub.faults) > 30, "attempts are few"
+    hub.faults.clear()
+    assert load(f"hub:{NAME}").episodes == 6
+
+
+def test_a_hub_that_asks_for_a_moment_gets_it(hub: Hub, folder: Path, no_pause):
+    hub.push(NAME, folder)
+    hub.faults.append(Fault("GET /blobs", status=429, headers={"Retry-After": "0"}))
+    began = time.monotonic()
+    assert load(f"hub:{NAME}").episodes == 6
+    assert time.monotonic() - began < 10
+
+
+def test_a_hub_that_asks_for_an_hour_is_out_of_reach(hub: Hub, folder: Path, no_pause):
+    hub.push(NAME, folder)
+    hub.faults += [Fault("GET /blobs", status=429, headers={"Retry-After": "3600"}) for _ in range(20)]
+    began = time.monotonic()
+    with pytest.raises(HubError, match=r"out of reach \(it asks for a pause of 3,600 s\)"):
+        load(f"hub:{NAME}")
+    assert time.monotonic() - began < 10
+
+
+def test_a_file_that_does_not_come_is_asked_for_again_and_then_given_up(
+    hub: Hub, folder: Path, no_pause, monkeypatch: pytest.MonkeyPatch
+):
+    hub.push(NAME, folder)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_DOWNLOAD_TIMEOUT", 0.2)
+    monkeypatch.setattr(hub_module, "ATTEMPTS", 1)
+    hub.faults += [Fault("GET /blobs", stall_s=0.6) for _ in range(60)]
+    began = time.monotonic()
+    with pytest.raises(HubError, match=r"out of reach \(ReadTimeout\)"):
+        load(f"hub:{NAME}")
+    assert time.monotonic() - began < 30
+    del hub.faults[1:]
+    assert load(f"hub:{NAME}").episodes == 6
+
+
+@pytest.mark.parametrize("where", ["GET /blobs", "GET /datasets"])
+def test_bytes_that_are_not_those_of_the_hash_are_fetched_again(hub: Hub, folder: Path, no_pause, where: str):
+    hub.push(NAME, folder)
+    hub.faults.append(Fault(where, change=lambda content: bytes(len(content))))
+    expected = read_dataset(folder, name="tiny").content_hash
+    assert load(f"hub:{NAME}").content_hash == expected
+    assert not hub.faults
+
+
+def test_bytes_that_never_are_those_of_the_hash_are_refused_and_not_kept(hub: Hub, folder: Path, no_pause):
+    hub.push(NAME, folder)
+    hub.faults += [Fault("GET /blobs", change=lambda content: content[::-1]) for _ in range(20)]
+    with pytest.raises(HubError, match=r"sent '.*' of 'owner/tiny' 3 times with other bytes than its own hash"):
+        load(f"hub:{NAME}")
+    hub.faults.clear()
+    assert load(f"hub:{NAME}").episodes == 6
+
+
+def test_a_branch_that_moves_in_the_middle_gives_one_commit(hub: Hub, folder: Path, tmp_path: Path):
+    old = hub.push(NAME, folder)
+    newer = write_v3(tmp_path / "newer", tiny_recording(6, 60, seed=5), episodes_per_file=3)
+    hub.faults.append(Fault("/resolve/", then=lambda: hub.push(NAME, newer)))
+    first = load(f"hub:{NAME}")
+    assert not hub.faults
+    assert (first.revision, first.content_hash) == (old, read_dataset(folder, name="tiny").content_hash)
+    second = load(f"hub:{NAME}")
+    assert second.revision != old
+    assert second.content_hash == read_dataset(newer, name="tiny").content_hash
+
+
+def test_a_listed_file_that_is_not_there(hub: Hub, folder: Path, no_pause):
+    hub.push(NAME, folder)
+    hub.faults += [Fault("HEAD /datasets", status=404, headers={"X-Error-Code": "EntryNotFound"}) for _ in range(20)]
+    with pytest.raises(HubError, match="lists a file of 'owner/tiny' that it does not have"):
+        load(f"hub:{NAME}")
+
+
+@pytest.mark.parametrize("status", [401, 403])
+def test_access_refused(hub: Hub, folder: Path, no_pause, status: int):
+    hub.push(NAME, folder)
+    hub.faults.append(Fault("/api/datasets", status=status))
+    with pytest.raises(HubError, match="hf auth login") as caught:
+        load(f"hub:{NAME}")
+    assert "hf_secret" not in str(caught.value)
+
+
+def test_a_private_data_set_with_the_token_from_its_file(hub: Hub, folder: Path, tmp_path: Path, monkeypatch, caplog):
+    hub.push(NAME, folder)
+    monkeypatch.delenv("HF_TOKEN")
+    home = tmp_path / "home"
+    home.mkdir()
+    (home / "token").write_text("hf_token_in_a_file")
+    script = "from pathlib import Path; from pipeline.lerobot_format.read import load_source;"
+    script += f"print(load_source('hub:{NAME}', name='tiny', config_dir=Path()).episodes)"
+    environment = {**os.environ, "HF_HOME": str(home), "HF_HUB_CACHE": str(tmp_path / "cache"), "HF_DEBUG": "1"}
+    ran = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert ran.stdout.strip().endswith("6")
+    assert "Bearer hf_token_in_a_file" in hub.tokens
+    assert "hf_token_in_a_file" not in ran.stdout + ran.stderr
