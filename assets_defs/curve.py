@@ -11,6 +11,7 @@ from pydantic import Field
 from assets_defs.data import PARTITIONS, episode_split
 from assets_defs.floor import ESTIMATES, multimodality_floor
 from assets_defs.plan import CODE_VERSIONS, Plan, Unit, curve_unit, sizes_of
+from assets_defs.policies import mlflow_run, tracking
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import picture, present, table
 from pipeline.config import hash_of
@@ -125,6 +126,7 @@ def _draw_curve(bench: Bench, unit: Unit, draft: Path) -> Outcome:
     """Train on every subset, keep the errors by size, and say what they mean."""
     from pipeline.curve import curve_sizes, full_size, train_subsets
     from pipeline.folds import PolicyTask
+    from pipeline.sinks import to_mlflow
     from pipeline.statistics.curve_reading import errors_file, keep_errors
     from pipeline.statistics.metrics import load_errors, save_errors
 
@@ -145,6 +147,8 @@ def _draw_curve(bench: Bench, unit: Unit, draft: Path) -> Outcome:
             save_errors(errors, draft / errors_file(size, order))
     save_errors(full, draft / errors_file(full_size(task.split), 0))
     said = _describe(bench, task, draft)
+    run_id = mlflow_run(bench, task, Unit(f"{policy}/trained_policy", observations))
+    to_mlflow.log_curve(tracking(bench), run_id, said["sizes"])
     table_value = bench.summary(predictions)["metrics"]["first_step_mae"]
     same = all(
         (e.episodes == full.episodes).all() and (e.anchors == full.anchors).all() for o in by_size.values() for e in o

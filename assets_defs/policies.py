@@ -55,19 +55,20 @@ def _everyone(bench: Bench) -> list[str]:
     return [v.name for v in bench.plan.variants]
 
 
-def _tracking(bench: Bench) -> str:
+def tracking(bench: Bench) -> str:
+    """Where MLflow is."""
     from pipeline.sinks.to_mlflow import tracking_uri
 
     return tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root)
 
 
-def _mlflow_run(bench: Bench, task, trained: Unit) -> str:
+def mlflow_run(bench: Bench, task, trained: Unit) -> str:
     """The MLflow run of a trained policy."""
     from pipeline.sinks.to_mlflow import find_run
 
     fingerprint = {"fingerprint": bench.plan.fingerprint(trained)}
     run_id = bench.summary(trained)["mlflow_run_id"]
-    return find_run(_tracking(bench), run_id, experiment=bench.plan.key, task=task, tags=fingerprint)
+    return find_run(tracking(bench), run_id, experiment=bench.plan.key, task=task, tags=fingerprint)
 
 
 def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
@@ -126,7 +127,7 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
     if known:
         picture_losses(folds[0], variant.name, _everyone(bench), draft / "losses.png")
     run_id = to_mlflow.log_training(
-        _tracking(bench),
+        tracking(bench),
         experiment=bench.plan.key,
         task=task,
         trained=folds,
@@ -211,8 +212,8 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
     save_errors(score.errors, draft / "errors.safetensors")
     picture_horizons(score.metrics, variant.name, _everyone(bench), task.demos, draft / "error_by_horizon.png")
     to_mlflow.log_scores(
-        _tracking(bench),
-        _mlflow_run(bench, task, trained_unit),
+        tracking(bench),
+        mlflow_run(bench, task, trained_unit),
         score.metrics,
         score.seed_metrics,
         artifacts=[draft / "error_by_horizon.png"],
@@ -274,7 +275,7 @@ def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcom
         return Outcome({"rollouts": None, "why_not": str(why)}, {"sane": (True, str(why))})
     save_rollouts(results, draft)
     summary = summarise_rollouts(results)
-    to_mlflow.log_rollouts(_tracking(bench), _mlflow_run(bench, task, trained_unit), summary)
+    to_mlflow.log_rollouts(tracking(bench), mlflow_run(bench, task, trained_unit), summary)
     in_range = bool(((results.best_reward >= 0) & (results.best_reward <= 1)).all())
     agree = bool((results.best_reward[results.success] >= 1).all())
     words = f"{summary['successes']} of {summary['n']} succeeded, score {summary['score']:.3f}"

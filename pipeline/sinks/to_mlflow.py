@@ -171,6 +171,17 @@ def log_rollouts(uri: str, run_id: str, summary: Mapping[str, Any]) -> None:
         _send(client, run_id, _series({f"rollout_{name}": value for name, value in summary.items()}))
 
 
+def log_curve(uri: str, run_id: str, sizes: Sequence[Mapping[str, Any]]) -> None:
+    """Add a learning curve: `curve_first_step_mae` and `curve_at_one_second_mae`, the step is the number of training episodes."""
+    later = [size["at_one_second"] for size in sizes if size["at_one_second"]]
+    series = {
+        "curve_first_step_mae": [(size["episodes"], size["error"]) for size in sizes],
+        "curve_at_one_second_mae": [(size["episodes"], size["error"]) for size in later],
+    }
+    with _client(uri) as client:
+        _send(client, run_id, series)
+
+
 def _children(client: Any, run_id: str) -> dict[str, str]:
     """Seed → id of the nested run."""
     experiment_id = client.get_run(run_id).info.experiment_id

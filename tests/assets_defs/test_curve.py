@@ -82,6 +82,18 @@ def test_errors_are_kept_by_size_on_the_same_episodes(drawn):
     assert len({e.absolute.sum() for e in by_size[4]}) == 3, "orders differ"
 
 
+def test_the_curve_is_in_mlflow_with_the_episodes_as_steps(drawn):
+    from mlflow import MlflowClient
+
+    benchmark, _, _ = drawn
+    plan = benchmark.plan()
+    run_id = benchmark.store.made(plan.folder(Unit("mlp_k01/trained_policy", "state"))).summary["mlflow_run_id"]
+    client = MlflowClient(f"sqlite:///{benchmark.store.root / 'mlflow.db'}")
+    logged = client.get_metric_history(run_id, "curve_first_step_mae")
+    sizes = benchmark.store.made(plan.folder(UNIT)).summary["sizes"]
+    assert [(m.step, m.value) for m in logged] == [(size["episodes"], pytest.approx(size["error"])) for size in sizes]
+
+
 def test_it_shows_the_answer_and_the_picture_in_the_ui(drawn):
     benchmark, _, _ = drawn
     with open_instance(benchmark.store.root) as instance:
