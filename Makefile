@@ -1,13 +1,14 @@
 # make demo    the whole benchmark on the embedded data set
 # make test    the tests; make test-slow the long ones
 # make ui      Dagster and MLflow on 127.0.0.1
+# make lerobot-env   LeRobot in an environment of its own, for the tests that need it
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo setup test test-slow ui speed lint clean
+.PHONY: demo setup test test-slow ui speed lint clean lerobot-env
 
 demo: $(READY)
 	$(BIN)/demobench run pusht_sim
@@ -38,6 +39,18 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports
+
+# LeRobot's pins exclude ours, and it wants Python 3.12: 5.7 GB on disk, most of it PyTorch with CUDA.
+LEROBOT := .lerobot
+LEROBOT_PYTHON ?= python3.12
+
+lerobot-env: $(LEROBOT)/.ready
+
+$(LEROBOT)/.ready:
+	@$(LEROBOT_PYTHON) -c 'import sys; sys.exit("LeRobot needs Python 3.12 or newer; set LEROBOT_PYTHON=…" if sys.version_info < (3, 12) else 0)'
+	$(LEROBOT_PYTHON) -m venv $(LEROBOT)
+	$(LEROBOT)/bin/python -m pip install --quiet --disable-pip-version-check 'lerobot[training,diffusion,smolvla]==0.6.1'
+	touch $@
 
 clean:
 	rm -rf results build dist *.egg-info

@@ -1,5 +1,6 @@
 """What runs by itself (a weekly schedule, and the sensor that makes the file's data sets appear as partitions), and the jobs."""
 
+import json
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -15,13 +16,16 @@ BENCHMARK = "benchmark"
 REBENCHMARK = "rebenchmark"
 CURVE = "curve"
 """Not part of a benchmark: it trains for longer than one."""
+SCORE = "score"
+"""Not part of a benchmark: somebody has to name a file. Its results stay in the table while they are up to date."""
 
 
 def automation(config: Config, policies: Sequence[Variant]) -> dict[str, list[Any]]:
     """The `jobs`, `schedules` and `sensors` of the definitions."""
     named_only = [v.name for v in policies if v.only_when_named]
     learning_curve = dg.AssetSelection.assets("learning_curve")
-    everything = dg.AssetSelection.all() - dg.AssetSelection.groups(*named_only) - learning_curve
+    with_scores = dg.AssetSelection.all() - dg.AssetSelection.groups(*named_only) - learning_curve
+    everything = with_scores - dg.AssetSelection.assets("scored_predictions")
     benchmark = dg.define_asset_job(
         BENCHMARK,
         selection=everything,
@@ -38,10 +42,15 @@ def automation(config: Config, policies: Sequence[Variant]) -> dict[str, list[An
         description="Would more demonstrations help? Trains one policy on parts of the training episodes; its predictions must be "
         "there. The policy is the data set's champion, or the one named in the launchpad.",
     )
+    score = dg.define_asset_job(
+        SCORE,
+        selection=with_scores,
+        description="Predictions made elsewhere become a row of the table: name their file in the launchpad (docs/scoring.md).",
+    )
     return {
-        "jobs": [benchmark, rebenchmark, curve],
+        "jobs": [benchmark, rebenchmark, curve, score],
         "schedules": [_weekly(config, rebenchmark)],
-        "sensors": [register_datasets],
+        "sensors": [register_datasets, _new_revision(rebenchmark)],
     }
 
 
@@ -74,6 +83,43 @@ def _weekly(config: Config, job: Any) -> dg.ScheduleDefinition:
             yield dg.SkipReason("every data set is up to date")
 
     return weekly_rebenchmark
+
+
+def _new_revision(job: Any) -> dg.SensorDefinition:
+    @dg.sensor(
+        name="new_hub_revision",
+        job=job,
+        minimum_interval_seconds=900,
+        description="Re-benchmarks a data set of the Hub when its branch or tag points at a commit that was not seen before. A "
+        "pinned commit never moves; a Hub that is out of reach is asked again at the next tick.",
+    )
+    def new_hub_revision(
+        context: dg.SensorEvaluationContext, workbench: dg.ResourceParam[Workbench]
+    ) -> dg.SensorResult | dg.SkipReason:
+        seen = json.loads(context.cursor or "{}")
+        ready = set(context.instance.get_dynamic_partitions(str(PARTITIONS.name)))
+        found = {key: commit for key, commit in _commits(workbench.config) if key in ready and seen.get(key) != commit}
+        if not found:
+            return dg.SkipReason("no data set of the Hub has moved")
+        requests = [
+            dg.RunRequest(run_key=f"{key}@{commit}", partition_key=key, asset_selection=stale)
+            for key, commit in found.items()
+            if (stale := stale_assets(workbench, key))
+        ]
+        return dg.SensorResult(run_requests=requests, cursor=json.dumps(seen | found))
+
+    return new_hub_revision
+
+
+def _commits(config: Config) -> Iterator[tuple[str, str]]:
+    """The data sets of the Hub with the commit that their revision stands for now; those that cannot be asked are left out."""
+    from pipeline.lerobot_format.hub import current_commit, parse_repository
+
+    for key, dataset in config.datasets.items():
+        if dataset.source.startswith("hub:"):
+            commit = current_commit(*parse_repository(dataset.source.removeprefix("hub:")))
+            if commit is not None:
+                yield key, commit
 
 
 @dg.sensor(

@@ -12,6 +12,8 @@ from assets_defs.floor import ESTIMATES
 from assets_defs.plan import Unit
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import interval_words, picture, present, table
+from pipeline.experiment import Variant
+from pipeline.methods import EXTERNAL
 
 TABLE = dg.AssetKey(["benchmark_table"])
 REPORT = dg.AssetKey(["benchmark_report"])
@@ -83,6 +85,7 @@ def _write_table(bench: Bench, draft) -> Outcome:
                 "rollouts": bench.summary(rolled).get("rollouts") if plan.is_fresh(rolled) else None,
             }
         )
+    entries += [_entry_from_elsewhere(bench, unit) for unit in plan.scored_units() if plan.is_fresh(unit)]
     floor = plan.folder(Unit("multimodality_floor"))
     floors, estimates = load_floors(floor / "radius.json"), load_estimates(floor / ESTIMATES)
     facts = bench.summary(Unit("demonstrations"))["inspect"]
@@ -111,9 +114,26 @@ def _write_table(bench: Bench, draft) -> Outcome:
     )
 
 
+def _entry_from_elsewhere(bench: Bench, unit: Unit) -> dict:
+    """A row that was predicted elsewhere: nothing is known of its size, its training or its speed."""
+    from pipeline.statistics.metrics import load_errors
+
+    said = bench.summary(unit)
+    return {
+        **said,
+        "variant": Variant(unit.entry, unit.entry, EXTERNAL, said["chunk"]),
+        "errors": load_errors(bench.plan.folder(unit) / "errors.safetensors"),
+        "parameters": None,
+        "train_s": 0.0,
+        "rollouts": None,
+        "elsewhere": {name: said[name] for name in ("seen_in_training", "training", "episodes", "samples", "warnings")}
+        | {"sight_stated": said["asked"]["observations"] is not None},
+    }
+
+
 def _choice_of_policies(bench: Bench, table) -> str:
     """What the command line must name where the table holds other policies than a run without choices makes."""
-    shown = {row["policy"] for row in table["policies"] if row["params"]}
+    shown = {row["policy"] for row in table["policies"] if row["params"] and row["method"] != EXTERNAL}
     usual = {v.name for v in bench.plan.variants if v.is_trained and not v.only_when_named}
     return "" if shown == usual or not shown else f" --policies {','.join(sorted(shown))}"
 
@@ -173,7 +193,7 @@ def _write_report(bench: Bench, draft) -> Outcome:
     plan = bench.plan
     built = json.loads((plan.folder(Unit("benchmark_table")) / "table.json").read_text())
     built["artifacts"] |= {"mcap": "../mcap_log/held_out.mcap", "rerun": "../rerun_recording/held_out.rrd"}
-    predictions = [load_predictions(plan.folder(u)) for u in plan.fresh_policy_units("predictions")]
+    predictions = [load_predictions(plan.folder(u)) for u in plan.fresh_predictions()]
     floors = load_floors(plan.folder(Unit("multimodality_floor")) / "radius.json")
     rolled = [u for u in plan.fresh_policy_units("rollouts") if bench.summary(u)["rollouts"]]
     figures = benchmark_figures(

@@ -6,8 +6,9 @@ from pathlib import Path
 import dagster as dg
 
 from assets_defs.plan import Unit
-from assets_defs.resources import Budget, Outcome, Workbench, check_spec, code_version, result
+from assets_defs.resources import Budget, Outcome, Workbench, check_spec, code_version, result, warning_spec
 from assets_defs.show import picture, present, table
+from pipeline.inspection.finding import CHECKS
 
 PARTITIONS = dg.DynamicPartitionsDefinition(name="datasets")
 GROUP = "data"
@@ -27,6 +28,7 @@ def key(name: str) -> dg.AssetKey:
             key("demonstrations"), "stored_as_read", "What lies in the store has the content hash of what was read."
         ),
         check_spec(key("demonstrations"), "counts", "Every episode has frames, and they add up to the whole."),
+        *(warning_spec(key("demonstrations"), name, words) for name, words in CHECKS.items()),
     ],
 )
 def demonstrations(
@@ -42,15 +44,15 @@ def demonstrations(
 
     def read(draft):
         from pipeline.config import hash_of
-        from pipeline.lerobot_format.quality import inspect_dataset, resolve_semantics
-        from pipeline.lerobot_format.read import load_source
+        from pipeline.inspection.look import inspect
+        from pipeline.inspection.videos import local_folder
+        from pipeline.lerobot_format.quality import inspect_dataset
+        from pipeline.lerobot_format.read import load_experiment
         from pipeline.lerobot_format.saved import save_demonstrations
         from pipeline.sinks.pictures import picture_demonstration
         from pipeline.windows import check_features
 
-        dataset = bench.experiment.dataset
-        demos = load_source(dataset.source, name=bench.experiment.name, config_dir=workbench.config_dir)
-        semantics = resolve_semantics(demos, kind=dataset.kind, circular=dataset.circular)
+        demos, semantics = load_experiment(bench.experiment, workbench.config_dir)
         for observation_set in bench.experiment.observation_sets:
             check_features(demos, observation_set)
         save_demonstrations(demos, draft / "frames")
@@ -58,9 +60,12 @@ def demonstrations(
         stored = hash_again(draft / "frames")
         meaning = [semantics.kinds, {k: list(v) for k, v in semantics.circular.items()}]
         shortest = int(demos.lengths.min())
+        found = inspect(demos, semantics, local_folder(bench.experiment.dataset.source, workbench.config_dir))
+        facts = inspect_dataset(demos, semantics) | found.as_json(bench.plan.key)
         return Outcome(
-            {"asked": asked, "inspect": inspect_dataset(demos, semantics), "fingerprint": hash_of([stored, meaning])},
+            {"asked": asked, "inspect": facts, "fingerprint": hash_of([stored, meaning])},
             {
+                **{name: found.verdict(name) for name in CHECKS},
                 "stored_as_read": (stored == demos.content_hash, f"content hash {stored[:16]}"),
                 "counts": (
                     shortest > 0 and int(demos.lengths.sum()) == demos.frames,
@@ -86,8 +91,14 @@ def demonstrations(
         ),
         "trajectories": picture(bench.plan.folder(unit) / "trajectories.png"),
         "warnings": dg.MetadataValue.md("\n".join(f"- {w}" for w in facts["warnings"])) if facts["warnings"] else None,
+        "look_at_first": table(
+            ["episode", "why", "command"],
+            [(one["episode"], " ".join(one["reasons"]), one["command"]) for one in facts["look_at"]],
+        ),
+        "worth_leaving_out": facts["exclude_line"] or None,
     }
-    return result(bench, key("demonstrations"), {"": made}, present(metadata), ["stored_as_read", "counts"])
+    checks = ["stored_as_read", "counts"]
+    return result(bench, key("demonstrations"), {"": made}, present(metadata), checks, warnings=tuple(CHECKS))
 
 
 def hash_again(folder: Path) -> str:

@@ -14,6 +14,8 @@ from assets_defs import data, floor
 from assets_defs.automation import automation
 from assets_defs.benchmark import benchmark_assets
 from assets_defs.curve import curve_assets
+from assets_defs.elsewhere import KEY as SCORED
+from assets_defs.elsewhere import elsewhere_assets
 from assets_defs.looking import looking_assets
 from assets_defs.policies import policy_assets
 from assets_defs.resources import Budget, Workbench
@@ -59,8 +61,9 @@ def build_defs(
         *floor.ASSETS,
         *branches,
         *curve_assets(predictions),
-        *benchmark_assets([*predictions, *rollouts], floor.ASSETS),
-        *looking_assets(predictions),
+        *elsewhere_assets(),
+        *benchmark_assets([*predictions, *rollouts, SCORED], floor.ASSETS),
+        *looking_assets([*predictions, SCORED]),
     ]
     return dg.Definitions(
         assets=assets,

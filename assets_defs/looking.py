@@ -26,7 +26,7 @@ def _held_out(bench: Bench) -> list[int]:
 def _predictions(bench: Bench) -> list:
     from pipeline.predict import load_predictions
 
-    return [load_predictions(bench.plan.folder(u)) for u in bench.plan.fresh_policy_units("predictions")]
+    return [load_predictions(bench.plan.folder(u)) for u in bench.plan.fresh_predictions()]
 
 
 def _mcap_log(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:

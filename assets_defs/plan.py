@@ -7,7 +7,7 @@ a run (which assets to select), by every asset's body (whether there is work), a
 What belongs here: which settings and inputs matter to which asset. What does not: doing the work.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from pipeline.methods import METHODS, is_own
 from pipeline.store import Store
 
 CODE_VERSIONS = {
-    "demonstrations": "1",
+    "demonstrations": "2",
     "episode_split": "1",
     "windows": "1",
     "multimodality_floor": "3",
@@ -28,6 +28,7 @@ CODE_VERSIONS = {
     "trained_policy": "1",
     "predictions": "2",
     "rollouts": "1",
+    "scored_predictions": "1",
     "benchmark_table": "3",
     "benchmark_report": "4",
     "mcap_log": "1",
@@ -39,6 +40,8 @@ DATA = ("demonstrations", "episode_split", "windows", "multimodality_floor")
 MODES = ("action_modes",)
 SUMMARIES = ("benchmark_table", "benchmark_report", "mcap_log", "rerun_recording")
 POLICY = ("trained_policy", "predictions", "rollouts")
+SCORED = "scored_predictions"
+"""Predictions made elsewhere, an entry a name."""
 
 FLOOR = {"radius": None, "probes": 2000, "min_neighbours": 5}
 """The notebook's floor settings, used by the benchmark; `demobench floor` takes others. None is the estimator's default."""
@@ -57,6 +60,11 @@ class Unit:
     def kind(self) -> str:
         return self.asset.split("/")[-1]
 
+    @property
+    def policy(self) -> str:
+        """The row that predictions belong to: a policy of ours, or the name of what was predicted elsewhere."""
+        return self.entry if self.asset == SCORED else self.asset.split("/")[0]
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -67,6 +75,7 @@ class Plan:
     observations  the observation sets it was asked for; empty for all
     look_at_source  whether the source itself is looked at; inside a run what was read at its start counts, so that a
                     revision that moves in the middle cannot mix two data sets
+    asked         predictions made elsewhere that are to be scored: name → what their score depends on
     """
 
     store: Store
@@ -76,6 +85,7 @@ class Plan:
     selected: tuple[str, ...] = ()
     observations: tuple[str, ...] = ()
     look_at_source: bool = True
+    asked: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     _memo: dict[Unit, str | None] = field(default_factory=dict, compare=False)
 
     @cached_property
@@ -100,7 +110,8 @@ class Plan:
         """Every result of the selection, inputs before what is made from them."""
         variants = [v for v in self.variants if not self.selected or v.name in self.selected]
         policies = [u for kind in POLICY for v in variants for u in self.selected_units(v, kind)]
-        return [Unit(asset) for asset in (*DATA, *MODES)] + policies + [Unit(asset) for asset in SUMMARIES]
+        scored = [Unit(SCORED, name) for name in self.asked]
+        return [Unit(asset) for asset in (*DATA, *MODES)] + policies + scored + [Unit(asset) for asset in SUMMARIES]
 
     def fingerprint(self, unit: Unit) -> str | None:
         """What the result's fingerprint would be now; None while something it is made from is not there or stale."""
@@ -139,13 +150,22 @@ class Plan:
         """The entries of all policies that are up to date: what the table, the page and the recordings show."""
         return [u for v in self.variants for u in self.policy_units(v, kind) if self.is_fresh(u)]
 
+    def scored_units(self) -> list[Unit]:
+        """Predictions made elsewhere: those in the store, and those to be scored."""
+        there = [folder.parent.name for folder in self.folder(Unit(SCORED)).glob("[!.]*/made.json")]
+        return [Unit(SCORED, name) for name in sorted({*there, *self.asked})]
+
+    def fresh_predictions(self) -> list[Unit]:
+        """All predictions that are up to date, ours first."""
+        return self.fresh_policy_units("predictions") + [u for u in self.scored_units() if self.is_fresh(u)]
+
     def _fingerprint(self, unit: Unit) -> str | None:
         if unit.kind == "demonstrations":
             return self._demonstrations()
         inputs = self.inputs(unit)
         if unit.asset in SUMMARIES:
             # A summary is made from whatever is up to date, so a policy that was never run does not hold it back.
-            inputs = [i for i in inputs if i.kind not in POLICY or self.is_fresh(i)]
+            inputs = [i for i in inputs if i.kind not in (*POLICY, SCORED) or self.is_fresh(i)]
         prints = {}
         for i in inputs:
             if not self.is_fresh(i):
@@ -164,12 +184,17 @@ class Plan:
 
     def asked_of_source(self) -> dict[str, Any]:
         """What decides whether the source must be read again."""
+        from pipeline.lerobot_format.joined import stamp_of_features
         from pipeline.lerobot_format.read import source_stamp
 
-        return {"stamp": source_stamp(self.experiment.dataset.source, Path.cwd()), **self._meaning()}
+        dataset = self.experiment.dataset
+        files = stamp_of_features(dataset.choice(Path.cwd()).features)
+        joined = {"joined": files} if files else {}
+        return {"stamp": source_stamp(dataset.source, Path.cwd()), **joined, **self._meaning()}
 
     def _meaning(self) -> dict[str, Any]:
-        settings = self.experiment.dataset.model_dump(mode="json", include={"source", "kind", "circular"})
+        said = {"source", "kind", "circular", "state", "action", "units", "features", "exclude"}
+        settings = self.experiment.dataset.model_dump(mode="json", include=said)
         return {"settings": settings, "code": CODE_VERSIONS["demonstrations"]}
 
     def inputs(self, unit: Unit) -> list[Unit]:
@@ -180,7 +205,7 @@ class Plan:
                 return []
             case "episode_split" | "action_modes":
                 return [data]
-            case "windows" | "multimodality_floor":
+            case "windows" | "multimodality_floor" | "scored_predictions":
                 return [data, Unit("episode_split")]
             case "trained_policy":
                 # Not the `windows` asset: it covers every chunk size of the file, and a new one must not retrain the rest.
@@ -193,10 +218,17 @@ class Plan:
             case "benchmark_table":
                 kinds = ("predictions", "rollouts")
                 policies = [u for kind in kinds for v in self.variants for u in self.policy_units(v, kind)]
+                policies += self.scored_units()
                 return [*(Unit(a) for a in ("episode_split", "multimodality_floor", "action_modes")), *policies]
             case _:
                 policies = [u for v in self.variants for u in self.policy_units(v, "predictions")]
+                policies += self.scored_units()
                 return [*([Unit("benchmark_table")] if unit.kind == "benchmark_report" else []), *policies]
+
+    def _asked_of_scored(self, unit: Unit) -> Mapping[str, Any]:
+        """What the score of predictions made elsewhere depends on: as asked for now, else as when they were scored."""
+        made = self.store.made(self.folder(unit))
+        return self.asked.get(unit.entry) or (made.summary.get("asked", {}) if made else {})
 
     def _settings(self, unit: Unit) -> dict[str, Any]:
         """The settings that matter to one result, and only those."""
@@ -222,6 +254,8 @@ class Plan:
                 return settings
             case "predictions":
                 return {"largest_chunk": e.largest_chunk}
+            case "scored_predictions":
+                return _dump(e, {"protocol", "history"}) | {"asked": self._asked_of_scored(unit)}
             case "rollouts":
                 return {"simulator": _installed(e.dataset.simulator), "rollouts": e.rollouts}
             case "benchmark_table":

@@ -5,7 +5,7 @@ asset's results are made, published, checked and described. What does not: what 
 """
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -182,9 +182,15 @@ class Bench:
 
 
 def result(
-    bench: Bench, asset_key: dg.AssetKey, made: Mapping[str, Made], metadata: Mapping[str, Any], checks: list[str]
+    bench: Bench,
+    asset_key: dg.AssetKey,
+    made: Mapping[str, Made],
+    metadata: Mapping[str, Any],
+    checks: Sequence[str],
+    *,
+    warnings: Sequence[str] = (),
 ) -> dg.MaterializeResult:
-    """An asset's result: its metadata, its data version, and every declared check.
+    """An asset's result: its metadata, its data version, and every declared check; `warnings` are those that stop nothing.
 
     `made` has one entry an observation set ("" for assets without). A check passes when it passes in every entry.
     """
@@ -197,18 +203,24 @@ def result(
     return dg.MaterializeResult(
         asset_key=asset_key,
         metadata={**metadata, **costs},
-        check_results=[_check(asset_key, name, made) for name in checks],
+        check_results=[
+            *(_check(asset_key, name, made, dg.AssetCheckSeverity.ERROR) for name in checks),
+            *(_check(asset_key, name, made, dg.AssetCheckSeverity.WARN) for name in warnings),
+        ],
         data_version=dg.DataVersion(version),
     )
 
 
-def _check(asset_key: dg.AssetKey, name: str, made: Mapping[str, Made]) -> dg.AssetCheckResult:
+def _check(
+    asset_key: dg.AssetKey, name: str, made: Mapping[str, Made], severity: dg.AssetCheckSeverity
+) -> dg.AssetCheckResult:
     verdicts = {entry: m.summary["checks"][name] for entry, m in made.items() if name in m.summary["checks"]}
     words = "; ".join(f"{entry}: {w}" if entry else w for entry, (_, w) in verdicts.items())
     return dg.AssetCheckResult(
         asset_key=asset_key,
         check_name=name,
         passed=all(passed for passed, _ in verdicts.values()),
+        severity=severity,
         metadata={"why": words or "nothing to check"},
     )
 
@@ -221,6 +233,11 @@ def asset_keys(units: Iterable[Unit]) -> list[dg.AssetKey]:
 def check_spec(asset: dg.AssetKey, name: str, description: str) -> dg.AssetCheckSpec:
     """A check that guards a number: when it fails, nothing that follows is made."""
     return dg.AssetCheckSpec(name, asset=asset, description=description, blocking=True)
+
+
+def warning_spec(asset: dg.AssetKey, name: str, description: str) -> dg.AssetCheckSpec:
+    """A check that tells people where to look, and stops nothing."""
+    return dg.AssetCheckSpec(name, asset=asset, description=description)
 
 
 def code_version(kind: str) -> str:

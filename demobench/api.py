@@ -49,22 +49,13 @@ def read(source: str | Path, *, config: Path | None = None, **settings: Any) -> 
     DatasetError, HubError : it cannot be read.
     ConfigError : a setting is unknown or out of range.
     """
+    from pipeline.lerobot_format.read import load_experiment
+
     path = find_config(config)
     config_dir = path.parent if path else Path.cwd()
     target = resolve_target(str(source), load_config(path), config_dir, Choices(), {})
     experiment = _changed(target.experiment, settings)
-    demos, semantics = open_demonstrations(experiment, config_dir)
-    return Dataset(demos, semantics, experiment)
-
-
-def open_demonstrations(experiment: Experiment, config_dir: Path) -> tuple[Demonstrations, Semantics]:
-    """What an experiment is about, and what its columns mean."""
-    from pipeline.lerobot_format.quality import resolve_semantics
-    from pipeline.lerobot_format.read import load_source
-
-    dataset = experiment.dataset
-    demos = load_source(dataset.source, name=experiment.name, config_dir=config_dir)
-    return demos, resolve_semantics(demos, kind=dataset.kind, circular=dataset.circular)
+    return Dataset(*load_experiment(experiment, config_dir), experiment)
 
 
 def _changed(experiment: Experiment, settings: Mapping[str, Any]) -> Experiment:

@@ -222,6 +222,98 @@ def curve(
     )  # fmt: skip
 
 
+@app.command(
+    epilog="""Examples:\n
+    demobench split tape                                         which episodes every fold holds out\n
+    demobench split tape --format lerobot --fold 0               what LeRobot's trainer takes\n
+    demobench split tape --format json --fold 0 --out fold0.json for score --trained-on"""
+)
+def split(
+    dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
+    form: Annotated[
+        Literal["text", "json", "lerobot"],
+        typer.Option(
+            "--format", help="text; json, which score --trained-on reads; or lerobot, an option of its trainer."
+        ),
+    ] = "text",
+    out: Annotated[Path | None, typer.Option(help="Write it to a file.")] = None,
+    folds: Annotated[int | None, typer.Option(min=1, help="Another number of folds than the benchmark's.")] = None,
+    fold: Annotated[
+        int | None, typer.Option(min=0, help="Only this fold, counted from 0: the one you train on.")
+    ] = None,
+    config: ConfigOption = None,
+    store: StoreOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Which episodes train and which are held out, so that you can train elsewhere without the held-out ones."""
+    from demobench.split import run_split
+
+    run_split(
+        dataset, form=form, out=out, folds=folds, fold=fold, config_path=config, store_path=store, json_to=json_to
+    )
+
+
+@app.command(
+    epilog="""Examples:\n
+    demobench score tape --write-anchors anchors.parquet         the rows to fill in\n
+    demobench score tape my_act.parquet --trained-on fold0.json  score them\n
+    demobench score tape --lerobot outputs/train/act --lerobot-python lerobot-env/bin/python\n
+    demobench score tape --remove my_act"""
+)
+def score(
+    dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
+    predictions: Annotated[
+        Path | None,
+        typer.Argument(metavar="[PREDICTIONS.parquet]", help="Predictions made anywhere (docs/scoring.md)."),
+    ] = None,
+    write_anchors: Annotated[
+        Path | None, typer.Option(metavar="OUT.parquet", help="Write the rows to fill in, and stop.")
+    ] = None,
+    fold: Annotated[
+        int | None, typer.Option(min=0, help="With --write-anchors: only the episodes that this fold holds out.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="The row's name; else the file's, or the checkpoint's.")] = None,
+    observations: Annotated[
+        str | None,
+        typer.Option(metavar="SET", help="It sees no more than this observation set: hold it against the set's floor."),
+    ] = None,
+    trained_on: Annotated[
+        Path | None,
+        typer.Option(help="What it was trained on: a split, a JSON list of episodes, or LeRobot's train_config.json."),
+    ] = None,
+    lerobot: Annotated[
+        Path | None, typer.Option(metavar="CHECKPOINT_DIR", help="Ask a LeRobot checkpoint instead of reading a file.")
+    ] = None,
+    lerobot_python: Annotated[
+        Path | None, typer.Option(metavar="PATH", help="The Python of the environment that has LeRobot.")
+    ] = None,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Where the LeRobot checkpoint is asked.")] = "cpu",
+    remove: Annotated[str | None, typer.Option(metavar="NAME", help="Take a row that was scored out again.")] = None,
+    config: ConfigOption = None,
+    store: StoreOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Predictions made anywhere become a row of the same table: same anchors, same intervals, same verdicts."""
+    from demobench.score import run_score
+
+    run_score(
+        dataset,
+        predictions,
+        write_anchors=write_anchors,
+        fold=fold,
+        name=name,
+        observations=observations,
+        trained_on=trained_on,
+        lerobot=lerobot,
+        lerobot_python=lerobot_python,
+        device=device,
+        remove=remove,
+        config_path=config,
+        store_path=store,
+        json_to=json_to,
+    )
+
+
 @app.command(epilog="Examples:\n\n    demobench view pusht_sim 0\n\n    demobench view pusht_sim 0 --save episode.rrd")
 def view(
     dataset: Annotated[str, typer.Argument(help="A data set that was benchmarked.")],

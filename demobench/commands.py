@@ -94,14 +94,10 @@ def run_benchmarks(
 
 def check_source(targets: Sequence[Target], session: Session) -> None:
     """Fail before any work when a folder is not there, or is no data set, or a policy's class cannot be had."""
-    from pipeline.lerobot_format.layout import read_layout
-    from pipeline.lerobot_format.read import source_stamp
+    from pipeline.lerobot_format.read import check_experiment
 
     for target in targets:
-        source = target.experiment.dataset.source
-        source_stamp(source, session.config_dir)
-        if not source.startswith(("embedded:", "hub:")):
-            read_layout(Path(source))
+        check_experiment(target.experiment, session.config_dir)
         for method in {v.method for v in target.selected if is_own(v.method)}:
             METHODS[method].load_class().check()
 
@@ -126,8 +122,15 @@ def _run_one(target: Target, session: Session) -> dict[str, Any]:
         else:
             console.print(f"[bold]{target.key}[/] is up to date: nothing to compute.")
     plan.forget()
-    report = _collect(target, plan, session)
-    _show(report, target, session)
+    report = collect(target, plan, session)
+    show(report, target, session)
+    for unit in plan.scored_units():
+        if not plan.is_fresh(unit):
+            console.print(
+                f"  [yellow]'{unit.entry}', predicted elsewhere, is not in the table: its data, settings or code changed. Score it "
+                "again with: demobench score[/]",
+                soft_wrap=True,
+            )
     return report
 
 
@@ -196,7 +199,7 @@ def materialise(
         progress.raise_failure(run.run_id)
 
 
-def _collect(target: Target, plan: Any, session: Session) -> dict[str, Any]:
+def collect(target: Target, plan: Any, session: Session) -> dict[str, Any]:
     """The table's JSON, less what was not asked for, with the paths of what was made."""
     from assets_defs.plan import Unit
 
@@ -212,11 +215,12 @@ def _collect(target: Target, plan: Any, session: Session) -> dict[str, Any]:
     return built
 
 
-def _show(report: Mapping[str, Any], target: Target, session: Session) -> None:
+def show(report: Mapping[str, Any], target: Target, session: Session, marked: str | None = None) -> None:
+    """The table and where its files are; `marked` is the address of the row that this is about."""
     from pipeline.table import render_table
 
     console = session.console
-    render_table(report, console)
+    render_table(report, console, marked)
     paths = report["artifacts"]
     opens = {
         "report": f"xdg-open {short(paths['report'])}",
@@ -254,27 +258,32 @@ def short(path: str) -> str:
 # inspect, floor -------------------------------------------------------------------------------------------------------
 
 
-def _open_dataset(argument: str, session: Session) -> tuple[Target, Any, Any]:
+def open_dataset(argument: str, session: Session, choices: Choices | None = None) -> tuple[Target, Any, Any]:
     """The data set of a name, folder or Hub address, and what its columns mean."""
-    from pipeline.lerobot_format.quality import resolve_semantics
-    from pipeline.lerobot_format.read import load_source
+    from pipeline.lerobot_format.read import load_experiment
 
     registered = session.store.experiments()
-    target = resolve_target(argument, session.config, session.config_dir, Choices(), registered)
-    dataset = target.experiment.dataset
-    demos = load_source(dataset.source, name=target.experiment.name, config_dir=session.config_dir)
-    return target, demos, resolve_semantics(demos, kind=dataset.kind, circular=dataset.circular)
+    target = resolve_target(argument, session.config, session.config_dir, choices or Choices(), registered)
+    return target, *load_experiment(target.experiment, session.config_dir)
 
 
 def inspect_dataset(argument: str, config_path: Path | None, json_to: str | None) -> None:
-    from demobench.show import show_inspection
+    """The facts of a data set, and what looks wrong with it."""
+    from demobench.inspection import show_inspection
+    from demobench.progress import status_line
+    from pipeline.inspection.look import inspect
+    from pipeline.inspection.videos import local_folder
     from pipeline.lerobot_format import quality
 
     session = open_session(config_path, None, json_to)
-    _, demos, semantics = _open_dataset(argument, session)
-    facts = quality.inspect_dataset(demos, semantics)
+    target, demos, semantics = open_dataset(argument, session)
+    folder = local_folder(target.experiment.dataset.source, session.config_dir)
+    with status_line(long=demos.frames > 200_000) as say:
+        found = inspect(demos, semantics, folder, say)
+    facts = quality.inspect_dataset(demos, semantics) | found.as_json(argument)
     if json_to != "-":
-        show_inspection(facts, session.console)
+        repeated = [*quality.dead_warnings(demos), *quality.clock_warnings(demos)]
+        show_inspection(facts, session.console, repeated)
     write_json_to(json_to, facts)
 
 
@@ -299,7 +308,7 @@ def measure_floor(
 
     session = open_session(config_path, None, json_to)
     asked = parse_horizons(horizons)
-    target, demos, semantics = _open_dataset(argument, session)
+    target, demos, semantics = open_dataset(argument, session)
     experiment = target.experiment
     sets = {s.name: s for s in experiment.observation_sets}
     wanted = parse_list(observations) or tuple(sets)
@@ -337,22 +346,22 @@ def view_episode(
     from pipeline.sinks import to_rerun
 
     session = open_session(config_path, store_path)
-    target, demos, semantics = _open_dataset(argument, session)
+    target, demos, semantics = open_dataset(argument, session)
     position = np.flatnonzero(demos.episode_ids == episode)
     if not len(position):
         raise ConfigError(
             f"'{target.key}' has no episode {episode}. Its episodes are {demos.episode_ids.min()} to {demos.episode_ids.max()}."
         )
     plan = Plan(session.store, target.key, target.experiment, tuple(target.experiment.variants))
-    units = plan.fresh_policy_units("predictions") if plan.is_fresh(Unit("demonstrations")) else []
+    units = plan.fresh_predictions() if plan.is_fresh(Unit("demonstrations")) else []
     wanted = parse_list(policy)
-    names = {u.asset.split("/")[0] for u in units}
+    names = {u.policy for u in units}
     for name in wanted:
         if name not in names:
             raise ConfigError(
                 f"No up-to-date predictions of a policy '{name}' for '{target.key}'. {did_you_mean(name, names)}"
             )
-    predictions = [load_predictions(plan.folder(u)) for u in units if not wanted or u.asset.split("/")[0] in wanted]
+    predictions = [load_predictions(plan.folder(u)) for u in units if not wanted or u.policy in wanted]
     frames = demos.episode(int(position[0]))
     if not any(len(p.in_frames(frames)) for p in predictions):
         session.console.print(_why_no_predictions(episode, predictions, demos, target, session), soft_wrap=True)

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 from demobench.commands import Session, open_session, write_json_to
 from pipeline.errors import ConfigError, StoreError, did_you_mean
 from pipeline.experiment import Choices, Variant, no_such_dataset, resolve_target
+from pipeline.methods import EXTERNAL
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from assets_defs.plan import Plan
+    from assets_defs.plan import Plan, Unit
     from pipeline.statistics.comparisons import Comparison, Paired
     from pipeline.types import EpisodeErrors, Protocol, Rollouts
 
@@ -42,9 +43,11 @@ class Address:
 class Entry:
     """One result to be compared, and what must be equal for that.
 
-    fingerprint, mlflow_run_id   either of them, or its beginning, is what `@run` pins
+    fingerprint, mlflow_run_id   either of them, or its beginning, is what `@run` pins; what was predicted elsewhere has no run
     rollouts                     closed-loop results, or None
     unit                         of the errors, where all action columns share one
+    steps                        of training; None where nobody here trained it
+    seen                         whether it was trained on the episodes it is scored on; None: nothing is known
     """
 
     key: str
@@ -58,9 +61,14 @@ class Entry:
     data_hash: str
     split_hash: str
     protocol: "Protocol"
-    steps: int
+    steps: int | None
     fingerprint: str
-    mlflow_run_id: str
+    mlflow_run_id: str | None
+    seen: bool | None = False
+
+    @property
+    def is_elsewhere(self) -> bool:
+        return self.steps is None
 
     @property
     def address(self) -> str:
@@ -77,6 +85,7 @@ def compare_policies(
     ConfigError : an address that names nothing, or too few or too many results.
     StoreError : a result that is not up to date, or a pin that the store no longer holds.
     """
+    from pipeline.external.pairing import UNKNOWN
     from pipeline.statistics.comparisons import judge
 
     session = open_session(config_path, store_path, json_to)
@@ -93,7 +102,11 @@ def compare_policies(
             f"{MOST_ROWS} results are compared at once. Name those that matter."
         )
     pairs = [pair for a, b in combinations(entries, 2) for pair in compare_entries(a, b)]
-    verdicts = judge(pairs)
+    unknown = {entry.address for entry in entries if entry.seen is None}
+    verdicts = [
+        replace(v, words=v.words + UNKNOWN) if v.word != "not comparable" and {v.a, v.b} & unknown else v
+        for v in judge(pairs)
+    ]
     family = sum(verdict.p_holm is not None for verdict in verdicts)
     if json_to != "-":
         show_verdicts(verdicts, family, entries, session.console)
@@ -141,6 +154,7 @@ def _entries(address: Address, session: Session) -> list[Entry]:
         for unit in plan.policy_units(variant, "predictions")
         if plan.is_fresh(unit)
     ]
+    fresh += [_elsewhere(unit, plan) for unit in plan.scored_units() if plan.is_fresh(unit)]
     if not fresh:
         units = [unit for variant in plan.variants for unit in plan.policy_units(variant, "predictions")]
         stale = any(session.store.made(plan.folder(unit)) for unit in units)
@@ -154,6 +168,12 @@ def _entries(address: Address, session: Session) -> list[Entry]:
     if address.pin:
         _check_pin(address, entries[0])
     return entries
+
+
+def _elsewhere(unit: "Unit", plan: "Plan") -> tuple[Variant, str]:
+    """What was predicted elsewhere, as a policy with an observation set."""
+    said = plan.store.made(plan.folder(unit)).summary
+    return Variant(unit.entry, unit.entry, EXTERNAL, said["chunk"]), said["observations"]
 
 
 def _choose(address: Address, fresh: Sequence[tuple[Variant, str]], plan: "Plan") -> tuple[Variant, str]:
@@ -184,7 +204,7 @@ def _choose(address: Address, fresh: Sequence[tuple[Variant, str]], plan: "Plan"
 
 def _load(plan: "Plan", variant: Variant, observations: str) -> Entry:
     """One result with what it rests on, from the store."""
-    from assets_defs.plan import Unit
+    from assets_defs.plan import SCORED, Unit
     from pipeline.simulate.trial import load_rollouts
     from pipeline.statistics.metrics import load_errors
 
@@ -192,9 +212,12 @@ def _load(plan: "Plan", variant: Variant, observations: str) -> Entry:
         return plan.store.made(plan.folder(unit))
 
     predictions, rollouts = (Unit(f"{variant.name}/{kind}", observations) for kind in ("predictions", "rollouts"))
+    elsewhere = variant.method == EXTERNAL
+    predictions = Unit(SCORED, variant.name) if elsewhere else predictions
     facts = made(Unit("demonstrations")).summary["inspect"]
     units = set(facts["action_units"])
-    rolled_out = plan.is_fresh(rollouts) and made(rollouts).summary["rollouts"]
+    rolled_out = not elsewhere and plan.is_fresh(rollouts) and made(rollouts).summary["rollouts"]
+    trained = None if elsewhere else made(Unit(f"{variant.name}/trained_policy", observations)).summary
     return Entry(
         key=plan.key,
         policy=variant.name,
@@ -207,17 +230,18 @@ def _load(plan: "Plan", variant: Variant, observations: str) -> Entry:
         data_hash=facts["content_hash"],
         split_hash=made(Unit("episode_split")).summary["hash"],
         protocol=plan.experiment.protocol,
-        steps=plan.experiment.steps,
+        steps=None if elsewhere else plan.experiment.steps,
         fingerprint=plan.fingerprint(predictions),
-        mlflow_run_id=made(Unit(f"{variant.name}/trained_policy", observations)).summary["mlflow_run_id"],
+        mlflow_run_id=trained["mlflow_run_id"] if trained else None,
+        seen=made(predictions).summary["seen_in_training"] if elsewhere else False,
     )
 
 
 def _check_pin(address: Address, entry: Entry) -> None:
-    if not any(name.startswith(address.pin) for name in (entry.fingerprint, entry.mlflow_run_id)):
+    if not any(name.startswith(address.pin) for name in (entry.fingerprint, entry.mlflow_run_id) if name):
         raise StoreError(
             f"The store no longer holds '{address.text}'. What it holds of {entry.address} is the result "
-            f"{entry.fingerprint} (MLflow run {entry.mlflow_run_id})."
+            f"{entry.fingerprint}{f' (MLflow run {entry.mlflow_run_id})' if entry.mlflow_run_id else ''}."
         )
 
 
@@ -226,22 +250,32 @@ def _check_pin(address: Address, entry: Entry) -> None:
 
 def compare_entries(a: Entry, b: Entry) -> list[tuple[str, str, str, "Paired | str"]]:
     """Two results on every metric that both have, or the first thing that keeps them from being compared."""
-    from pipeline.statistics.comparisons import compare_errors, horizons_in_common
+    from pipeline.statistics.comparisons import horizons_in_common
 
-    trained = (a.trained, b.trained)
     why = _data_differs(a, b)
     if why is None:
-        first = compare_errors(a.errors, b.errors, 0, a.protocol, trained=trained)
+        first = _compare_at(a, b, 0)
         why = first if isinstance(first, str) else _recipe_differs(a, b)
     if why:
         return [(a.address, b.address, "first_step_mae", why)]
     found: list[tuple[str, str, str, Paired | str]] = [
-        (a.address, b.address, metric, compare_errors(a.errors, b.errors, horizon, a.protocol, trained=trained))
+        (a.address, b.address, metric, _compare_at(a, b, horizon))
         for metric, horizon in horizons_in_common(a.errors, b.errors, a.fps).items()
     ]
     if a.rollouts is not None and b.rollouts is not None and (pair := compare_rollouts(a.rollouts, b.rollouts)):
         found.append((a.address, b.address, "success", pair))
     return found
+
+
+def _compare_at(a: Entry, b: Entry, horizon: int) -> "Paired | str":
+    """Two results at a horizon: ours on the same episodes, what was predicted elsewhere on those that both hold out."""
+    from pipeline.external.pairing import Rival, compare_common
+    from pipeline.statistics.comparisons import compare_errors
+
+    if a.is_elsewhere or b.is_elsewhere:
+        rivals = (Rival(e.address, e.errors, e.trained, e.seen) for e in (a, b))
+        return compare_common(*rivals, horizon, a.protocol)
+    return compare_errors(a.errors, b.errors, horizon, a.protocol, trained=(a.trained, b.trained))
 
 
 def _data_differs(a: Entry, b: Entry) -> str | None:
@@ -254,7 +288,7 @@ def _data_differs(a: Entry, b: Entry) -> str | None:
 def _recipe_differs(a: Entry, b: Entry) -> str | None:
     if a.protocol != b.protocol:
         return f"protocol differs: {a.protocol} and {b.protocol}"
-    if a.trained and b.trained and a.steps != b.steps:
+    if a.trained and b.trained and a.steps != b.steps and not (a.is_elsewhere or b.is_elsewhere):
         return f"budget differs: {a.steps:,} and {b.steps:,} steps"
     return None
 
@@ -386,5 +420,6 @@ def _footnotes(verdicts: Sequence["Comparison"], family: int, entries: Sequence[
             "success: a difference above zero is better; exact McNemar, one network of each (seed 0 of fold 0)."
         )
     if len(entries) <= 4:
-        lines += [f"{e.address}@{e.fingerprint}  MLflow run {e.mlflow_run_id}" for e in entries]
+        lines += [f"{e.address}@{e.fingerprint}  {f'MLflow run {e.mlflow_run_id}' if e.mlflow_run_id else 'predicted elsewhere'}"
+                  for e in entries]  # fmt: skip
     return lines

@@ -66,14 +66,14 @@ def _check_sizes(target: Target, plan: Any, session: Session, asked: Sequence[in
     from assets_defs.plan import Unit
     from pipeline.curve import curve_sizes
     from pipeline.folds import split_of
-    from pipeline.lerobot_format.read import load_source
+    from pipeline.lerobot_format.read import load_experiment
     from pipeline.split import load_split
 
     e = target.experiment
     if plan.is_fresh(Unit("episode_split")):
         split = load_split(plan.folder(Unit("episode_split")) / "split.json")
     else:
-        demos = load_source(e.dataset.source, name=e.name, config_dir=session.config_dir)
+        demos, _ = load_experiment(e, session.config_dir)
         split = split_of(e, demos)
     curve_sizes(split, asked)
 

@@ -144,3 +144,18 @@ def counting_bar(console: Console, what: str, total: int) -> Iterator[Callable[[
     ) as bars:  # fmt: skip
         task = bars.add_task(what, total=total)
         yield lambda done, total: bars.update(task, completed=done, total=total)
+
+
+@contextmanager
+def status_line(*, long: bool) -> Iterator[Callable[[str, int, int], None] | None]:
+    """A bar on standard error for work that takes more than a moment; yields `say(what, done, total)`, or None."""
+    console = Console(stderr=True)
+    if not long or not console.is_terminal:
+        yield None
+        return
+    with Progress(
+        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24), TimeElapsedColumn(), console=console,
+        transient=True,
+    ) as bars:  # fmt: skip
+        task = bars.add_task("looking", total=None)
+        yield lambda what, done, total: bars.update(task, description=f"looking: {what}", completed=done, total=total)

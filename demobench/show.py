@@ -1,4 +1,4 @@
-"""Terminal output of `inspect` and `floor`. What does not belong here: computing anything."""
+"""Terminal output of `floor`. What does not belong here: computing anything."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,34 +12,6 @@ from pipeline.types import FloorEstimate, RadiusFloor
 
 def _number(value: float | None, digits: int = 4) -> str:
     return "—" if value is None or value != value else f"{value:.{digits}g}"
-
-
-def show_inspection(facts: Mapping[str, Any], console: Console) -> None:
-    """The facts of `quality.inspect_dataset`."""
-    lengths = facts["episode_length"]
-    console.print(f"[bold]{escape(facts['name'])}[/]  {escape(facts['source'])}", soft_wrap=True)
-    revision = f" · revision {facts['revision'][:12]}" if facts["revision"] else ""
-    console.print(
-        f"{facts['episodes']:,} episodes · {facts['frames']:,} frames · {facts['fps']:g} fps · "
-        f"{lengths['min']} to {lengths['max']} frames an episode (median {lengths['median']:g}){revision}",
-        soft_wrap=True,
-    )
-    console.print(f"content hash {facts['content_hash']}\n", soft_wrap=True)
-    features = Table("feature", "columns", "units", title="Features", title_justify="left")
-    for feature in facts["features"]:
-        units = ", ".join(dict.fromkeys(u or "?" for u in feature["units"]))
-        features.add_row(escape(feature["key"]), escape(", ".join(feature["names"])), escape(units))
-    console.print(features)
-    actions = Table("action", "kind", "unit", "tracking lag, mean |a − s|", title="Actions", title_justify="left")
-    columns = (facts["action_names"], facts["action_kinds"], facts["action_units"], facts["tracking_lag"])
-    for name, kind, unit, lag in zip(*columns, strict=True):
-        actions.add_row(escape(name), kind, unit or "?", _number(lag))
-    console.print(actions)
-    for camera in facts["cameras"]:
-        there = "there" if camera["present"] else "declared, but its files are absent"
-        console.print(f"camera {escape(camera['key'])} {camera['width']}×{camera['height']}: {there}", soft_wrap=True)
-    for warning in facts["warnings"]:
-        console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
 
 
 LOSSES = {"rmse": "RMSE", "mae": "MAE", "l2": "L2"}

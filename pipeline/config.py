@@ -10,13 +10,13 @@ import os
 import re
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 
 from pipeline.errors import ConfigError, did_you_mean
 from pipeline.methods import EXTERNAL, METHODS, is_own
-from pipeline.types import ActionKind, Protocol
+from pipeline.types import ActionKind, ColumnChoice, Protocol
 
 BUDGETS = {"quick": 600, "standard": 3_000, "thorough": 20_000}
 """Training steps of each named budget."""
@@ -26,9 +26,19 @@ BudgetName = Literal["quick", "standard", "thorough"]
 
 
 class Settings(BaseModel):
-    """Base of every block of the file: frozen, and an unknown key is an error."""
+    """Base of every block of the file: frozen, and an unknown key is an error.
+
+    A key named in `optional` is left out of a dump where it has its default: a key that is new to the project must not
+    change the hash of settings that do not use it.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    optional: ClassVar[frozenset[str]] = frozenset()
+
+    @model_serializer(mode="wrap")
+    def _without_unused_options(self, dump):
+        unused = {key for key in self.optional if getattr(self, key) == type(self).model_fields[key].default}
+        return {key: value for key, value in dump(self).items() if key not in unused}
 
 
 class StoreConfig(Settings):
@@ -87,6 +97,18 @@ class DatasetConfig(Settings):
     observations: dict[str, tuple[str, ...] | ObservationConfig] = {"state": ("observation.state",)}
     champion: str | None = None
     floor_horizons: tuple[Annotated[int, Field(ge=0, le=10_000)], ...] | None = None
+    state: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    action: str | None = None
+    units: str | dict[str, str] | None = None
+    features: dict[str, str] = {}
+    exclude: tuple[Annotated[int, Field(ge=0)], ...] = ()
+
+    optional = frozenset({"state", "action", "units", "features", "exclude"})
+
+    def choice(self, config_dir: Path) -> ColumnChoice:
+        """Which columns and episodes are used; the files of joined features are relative to `config_dir`."""
+        files = {name: config_dir / Path(file).expanduser() for name, file in self.features.items()}
+        return ColumnChoice(self.state, self.action, self.units, files, tuple(sorted(set(self.exclude))))
 
 
 class PolicyConfig(Settings):
@@ -97,6 +119,8 @@ class PolicyConfig(Settings):
     observations: Literal["all"] | tuple[str, ...] = "all"
     only_when_named: bool = False
     settings: dict[str, Any] = {}
+
+    optional = frozenset({"settings"})
 
 
 class ScheduleConfig(Settings):

@@ -23,7 +23,7 @@ from pipeline.config import (
     hash_of,
 )
 from pipeline.errors import ConfigError, did_you_mean
-from pipeline.methods import METHODS, is_own
+from pipeline.methods import EXTERNAL, METHODS, is_own
 from pipeline.types import ObservationSet, Protocol
 
 
@@ -169,7 +169,7 @@ def _experiment(config: Config, name: str, dataset: DatasetConfig, config_dir: P
         budget, steps = None, benchmark.steps
     made = Experiment(
         name=name,
-        dataset=dataset.model_copy(update={"source": absolute_source(dataset.source, config_dir)}),
+        dataset=_absolute_dataset(dataset, config_dir),
         policies=dict(BASELINES) | {name: _absolute_method(p, config_dir) for name, p in config.policies.items()},
         protocol=benchmark.protocol,
         history=benchmark.history,
@@ -204,6 +204,14 @@ def absolute_source(source: str, config_dir: Path) -> str:
     if source.startswith(("embedded:", "hub:")):
         return source
     return str((config_dir / Path(source).expanduser()).resolve())
+
+
+def _absolute_dataset(dataset: DatasetConfig, config_dir: Path) -> DatasetConfig:
+    """The data set with absolute paths: its source's, and those of features that are joined."""
+    update: dict[str, Any] = {"source": absolute_source(dataset.source, config_dir)}
+    if dataset.features:
+        update["features"] = {name: str(path.resolve()) for name, path in dataset.choice(config_dir).features.items()}
+    return dataset.model_copy(update=update)
 
 
 def _absolute_method(policy: PolicyConfig, config_dir: Path) -> PolicyConfig:
@@ -274,7 +282,7 @@ def _base(argument: str, config: Config, config_dir: Path, registered: Mapping[s
         return argument, from_config(config, argument, config_dir)
     if argument in registered:
         return argument, Experiment.model_validate(registered[argument])
-    is_path = "/" in argument or argument in (".", "..") or Path(argument).is_dir()
+    is_path = "/" in argument or argument in (".", "..") or Path(argument).is_dir() or argument.lower().endswith(".zip")
     if not (argument.startswith(("hub:", "embedded:")) or is_path):
         raise no_such_dataset(argument, [*config.datasets, *registered])
     source = absolute_source(argument, Path.cwd())
@@ -380,15 +388,19 @@ def _parse_numbers(option: str, text: str | None, least: int) -> tuple[int, ...]
 
 
 def select_rows(rows: Iterable[Mapping[str, Any]], target: Target) -> list[Mapping[str, Any]]:
-    """The rows of a table that a run asked for; a method that sees no observation set is asked for with any."""
+    """The rows of a table that a run asked for; a method that sees no observation set is asked for with any.
+
+    What was predicted elsewhere stays: somebody added it to this table by name.
+    """
     names = {v.name for v in target.selected}
     return [
         row
         for row in rows
-        if row["policy"] in names
+        if row["method"] == EXTERNAL
+        or (row["policy"] in names
         and (
             not target.observations
             or row["observations"] in target.observations
             or not METHODS[row["method"]].uses_observations
-        )
+        ))
     ]

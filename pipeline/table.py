@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.experiment import Experiment
+from pipeline.external.pairing import Rival, compare_elsewhere
 from pipeline.sinks.findings import (
     MARKS,
     NOT_HELD,
@@ -18,10 +19,13 @@ from pipeline.sinks.findings import (
     address,
     answer,
     champion,
+    elsewhere_words,
     families_words,
     first_step_gap,
     gap_parts,
     interval_words,
+    is_elsewhere,
+    is_seen,
     not_held,
     without_floor,
 )
@@ -58,7 +62,9 @@ def build_table(
     facts : what `quality.inspect_dataset` found.
     floors, estimates : the notebook's floors, and those that policies are held against.
     entries : one a row: `variant`, `observations`, `metrics` (`metrics.Score.metrics`), `errors` (`EpisodeErrors`),
-        `windows_train`, `windows_test`, `latency_ms`, `parameters`, `train_s` and `rollouts` (a summary or None).
+        `windows_train`, `windows_test`, `latency_ms`, `parameters`, `train_s` and `rollouts` (a summary or None). One that was
+        predicted elsewhere also has `elsewhere`: `seen_in_training`, `training` (words), `episodes`, `samples`, `warnings` and
+        `sight_stated`.
     modes : `modes.ModesEvidence` as dictionaries.
 
     Returns
@@ -91,7 +97,7 @@ def dataset_json(facts: Mapping[str, Any]) -> dict[str, Any]:
     """The `dataset` object of every command's JSON."""
     keys = (
         "name", "revision", "content_hash", "episodes", "frames", "fps", "action_names", "action_units", "action_kinds",
-        "tracking_lag", "warnings",
+        "tracking_lag", "excluded", "warnings",
     )  # fmt: skip
     return json_safe({key: facts[key] for key in keys})
 
@@ -103,10 +109,18 @@ def _compare(
     entries: Sequence[Mapping[str, Any]],
 ) -> list[dict[str, Any]]:
     """Every row against hold-still and against the champion; the words go into the rows' `verdict`."""
-    scored = [(entry["variant"].name, entry["observations"], entry["errors"]) for entry in entries]
+    ours = [entry for entry in entries if "elsewhere" not in entry]
+    scored = [(entry["variant"].name, entry["observations"], entry["errors"]) for entry in ours]
     champion = experiment.dataset.champion
-    baselines = [entry["variant"].name for entry in entries if not entry["variant"].is_trained]
+    baselines = [entry["variant"].name for entry in ours if not entry["variant"].is_trained]
     found = table_comparisons(scored, champion, facts["fps"], experiment.protocol, baselines=baselines)
+    rivals = {comparison.b for comparison in found}
+    found += compare_elsewhere(
+        [_rival(entry) for entry in entries if "elsewhere" in entry],
+        [one for one in map(_rival, ours) if one.address in rivals],
+        facts["fps"],
+        experiment.protocol,
+    )
     by_address = {f"{row['policy']}/{row['observations']}": row for row in rows}
     for comparison in found:
         rival = "vs_hold_still" if comparison.b.startswith("hold_still/") else "vs_champion"
@@ -115,8 +129,21 @@ def _compare(
         )
         ahead = "_at_one_second" if comparison.metric == "at_one_second_mae" else ""
         for name in rivals:
-            by_address[comparison.a]["verdict"][name + ahead] = comparison.word
+            seen = by_address[comparison.a].get("seen_in_training")
+            by_address[comparison.a]["verdict"][name + ahead] = None if seen else comparison.word
     return [asdict(comparison) for comparison in found]
+
+
+def _rival(entry: Mapping[str, Any]) -> Rival:
+    address = f"{entry['variant'].name}/{entry['observations']}"
+    seen = entry["elsewhere"]["seen_in_training"] if "elsewhere" in entry else False
+    return Rival(address, entry["errors"], entry["variant"].is_trained, seen)
+
+
+def _is_held(entry: Mapping[str, Any]) -> bool:
+    """Whether a row may be held against a floor: it says what it sees, and was not trained on what it is scored on."""
+    elsewhere = entry.get("elsewhere")
+    return elsewhere is None or (elsewhere["sight_stated"] and elsewhere["seen_in_training"] is False)
 
 
 def _against_floors(
@@ -140,6 +167,7 @@ def _against_floors(
             e["errors"],
         )
         for e in entries
+        if _is_held(e)
     ]
     brackets = form_brackets(estimates, scored, sights)
     sound = {(b["observations"], b["horizon"], b["loss"]) for b in brackets if b["lower"] is not None}
@@ -191,7 +219,7 @@ def _row(entry: Mapping[str, Any], experiment: Experiment) -> dict[str, Any]:
         "method": variant.method,
         "chunk": variant.chunk,
         "observations": entry["observations"],
-        "seeds": experiment.seeds if variant.is_trained else 1,
+        "seeds": entry.get("seeds") or (experiment.seeds if variant.is_trained else 1),
         "windows_train": entry["windows_train"],
         "windows_test": entry["windows_test"],
         **{metric: metrics[metric] for metric in METRICS},
@@ -206,6 +234,7 @@ def _row(entry: Mapping[str, Any], experiment: Experiment) -> dict[str, Any]:
         },
         "above_floor": [],
         "rollouts": entry["rollouts"],
+        **entry.get("elsewhere", {}),
     }
 
 
@@ -229,8 +258,11 @@ def json_safe(value: Any) -> Any:
     return value
 
 
-def render_table(table: Mapping[str, Any], console: "Console") -> None:
-    """Draw the table, best first step on top; below it the answer in words, and what its numbers rest on."""
+def render_table(table: Mapping[str, Any], console: "Console", marked: str | None = None) -> None:
+    """Draw the table, best first step on top; below it the answer in words, and what its numbers rest on.
+
+    `marked` is the address of the row that somebody asked about.
+    """
     from rich.markup import escape
 
     dataset = table["dataset"]
@@ -241,7 +273,7 @@ def render_table(table: Mapping[str, Any], console: "Console") -> None:
         f"{dataset['fps']:g} fps · {len(dataset['action_names'])} action columns ({_units_words(dataset)})",
         soft_wrap=True,
     )
-    grid, left_out = _grid(table, unit, console)
+    grid, left_out = _grid(table, unit, console, marked)
     console.print(grid)
     for sentence in answer(table):
         console.print(_styled(sentence))
@@ -270,11 +302,13 @@ class _Column:
     gives_way: int = 0
 
 
-def _grid(table: Mapping[str, Any], unit: str | None, console: "Console") -> tuple[Any, list[str]]:
+def _grid(
+    table: Mapping[str, Any], unit: str | None, console: "Console", marked: str | None = None
+) -> tuple[Any, list[str]]:
     """The table as wide as the console allows, and the heads of the columns that had to be left out."""
     columns, left_out = _columns(table, unit), []
     while True:
-        grid = _draw(table["policies"], columns)
+        grid = _draw(table["policies"], columns, marked)
         expendable = [column for column in columns if column.gives_way]
         if console.measure(grid, options=console.options.update(width=1000)).maximum <= console.width or not expendable:
             return grid, left_out
@@ -283,7 +317,7 @@ def _grid(table: Mapping[str, Any], unit: str | None, console: "Console") -> tup
         left_out.append(" ".join(least.head.split()))
 
 
-def _draw(rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column]):
+def _draw(rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column], marked: str | None = None):
     from rich import box
     from rich.table import Table
 
@@ -291,7 +325,12 @@ def _draw(rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column]):
     for column in columns:
         grid.add_column(column.head, justify="left" if column.head in ("policy", "sees") else "right", no_wrap=True)
     for row in rows:
-        grid.add_row(*(column.cell(row) for column in columns), style=None if row["params"] else "dim")
+        here = address(row) == marked
+        learns = row["params"] or is_elsewhere(row)
+        cells = [column.cell(row) for column in columns]
+        grid.add_row(
+            f"→ {cells[0]}" if here else cells[0], *cells[1:], style="bold" if here else "" if learns else "dim"
+        )
     return grid
 
 
@@ -309,7 +348,7 @@ def _columns(table: Mapping[str, Any], unit: str | None) -> list[_Column]:
         return _number(row["rollouts"] and row["rollouts"].get("score"), 3)
 
     columns = [
-        _Column("policy", lambda row: escape(row["policy"])),
+        _Column("policy", lambda row: escape(row["policy"]) + (" (seen in training)" if is_seen(row) else "")),
         _Column("sees", lambda row: escape(row["observations"])),
         _Column(f"first step\nMAE{in_unit}", _first_step),
         _Column("\n× hold-still", number("vs_hold_still", 3)),
@@ -429,6 +468,7 @@ def _footnotes(table: Mapping[str, Any]) -> list[str]:
             "above floor: the first action's RMSE less the least that a policy of what it sees can have (gamma); "
             "none where a baseline sees more than the set it stands with"
         )
+    lines += elsewhere_words(table)
     lines += [f"no floor of '{name}' at the first action: {why}" for name, why in without_floor(table).items()]
     if not_held(table):
         lines.append(NOT_HELD)

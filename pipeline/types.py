@@ -12,7 +12,8 @@ horizon h = 0 is the action recorded at the anchor's own frame. Frames are numbe
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -45,6 +46,27 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class ColumnChoice:
+    """What a user says about the columns and episodes of a data set; the default leaves them as they are recorded.
+
+    state     features that, side by side, are the state; None: `observation.state`, else what is plainly meant
+    action    the feature that is the action; None: `action`, else what is plainly meant
+    units     of the columns of action and state: one for all of them, or by column name
+    features  name → a parquet file with one value a frame, joined as a feature of that name
+    exclude   recorded `episode_index` of episodes that are left out, ascending
+    """
+
+    state: tuple[str, ...] | None = None
+    action: str | None = None
+    units: str | Mapping[str, str] | None = None
+    features: Mapping[str, Path] = field(default_factory=dict)
+    exclude: tuple[int, ...] = ()
+
+
+AS_RECORDED = ColumnChoice()
+
+
+@dataclass(frozen=True)
 class Demonstrations:
     """Demonstrations in memory: one array a feature, episodes one after another.
 
@@ -57,6 +79,7 @@ class Demonstrations:
     revision        the Hub commit, where there is one
     content_hash    sha256 over the arrays above, names and fps: equal for equal demonstrations whatever the file layout
     warnings        what differed from the format's promises without making a number wrong
+    excluded        recorded `episode_index` of the episodes that the user left out
     """
 
     name: str
@@ -73,6 +96,7 @@ class Demonstrations:
     cameras: tuple[Camera, ...]
     warnings: tuple[str, ...]
     content_hash: str
+    excluded: tuple[int, ...] = ()
 
     @property
     def frames(self) -> int:

@@ -123,18 +123,23 @@ def _read_text(folder: Path, relative: str) -> str:
 
 def open_parquet(folder: Path, relative: str) -> "pq.ParquetFile":
     """A parquet file of the data set, its footer read and nothing else."""
+    path = inside(folder, relative)
+    if not path.exists():
+        raise DatasetError(
+            f"{path} is missing, though the data set's own lists name it. Copy or download the data set again."
+        )
+    return open_outside(path)
+
+
+def open_outside(path: Path) -> "pq.ParquetFile":
+    """A parquet file that the user named, its footer read and nothing else."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    path = inside(folder, relative)
     try:
         return pq.ParquetFile(path)
-    except FileNotFoundError:
-        raise DatasetError(
-            f"{path} is missing, though the data set's own lists name it. Copy or download the data set again."
-        ) from None
     except (pa.ArrowException, OSError) as error:
-        raise DatasetError(f"{path} {_damage(error)}") from None
+        raise DatasetError(f"{path} {damage(error)}") from None
 
 
 def read_table(folder: Path, relative: str, keep: Callable[[str], bool] = lambda name: True) -> "pa.Table":
@@ -146,10 +151,11 @@ def read_table(folder: Path, relative: str, keep: Callable[[str], bool] = lambda
         try:
             return file.read(columns=wanted, use_threads=False)
         except (pa.ArrowException, OSError) as error:
-            raise DatasetError(f"{folder / relative} {_damage(error)}") from None
+            raise DatasetError(f"{folder / relative} {damage(error)}") from None
 
 
-def _damage(error: Exception) -> str:
+def damage(error: Exception) -> str:
+    """What is wrong with a parquet file, after its path."""
     reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
     return (
         f"cannot be read as parquet: it is cut off or damaged. Copy the data set again. (parquet says: {reason[:160]})"

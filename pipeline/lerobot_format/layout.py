@@ -2,7 +2,7 @@
 
 v2.0 and v2.1 keep one data file an episode and JSON lines; v3.0 keeps many episodes a file and parquet. From here
 on they are the same `Layout`. What belongs here: meta/. What does not: the frames (frames.py), and whether frames and
-meta/ agree (read.py).
+meta/ agree (placing.py, read.py).
 """
 
 import math
@@ -12,11 +12,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import DatasetError
+from pipeline.errors import ConfigError, DatasetError
 from pipeline.lerobot_format.cameras import read_camera
+from pipeline.lerobot_format.columns import Roles, choose_roles
 from pipeline.lerobot_format.files import fill, inside, read_json, read_json_lines, read_table
 from pipeline.lerobot_format.units import column_names, unit_of
-from pipeline.types import ACTION, STATE, Camera, Feature
+from pipeline.types import ACTION, AS_RECORDED, STATE, Camera, ColumnChoice, Feature
 
 INFO = "meta/info.json"
 INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
@@ -25,37 +26,63 @@ INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_ind
 MAX_WIDTH = 4096
 """Numbers a frame of one feature may hold; what is larger is a picture in disguise, and left out."""
 
-_NUMBERS = {"bool", *(f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64))}
+_NUMBERS = {
+    "bool",
+    "float",
+    "double",
+    *(f"{kind}{bits}" for kind in ("float", "int", "uint") for bits in (8, 16, 32, 64)),
+}
 _EPISODE_COLUMNS = {"episode_index", "length", "tasks"}
 
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """One episode as meta/ lists it. `task` is None where only the frames' `task_index` can say; `file` is relative."""
+    """One episode as meta/ lists it. `task` is None where only the frames' `task_index` can say; `file` is relative, and
+    None where meta/ does not say in which file the episode is.
+    """
 
     id: int
     length: int
-    file: str
+    file: str | None
     task: str | None
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Everything meta/ says, checked in itself. `episodes` in the order of their ids; `tasks` task_index → words."""
+    """Everything meta/ says, checked in itself.
+
+    features  as recorded; `roles` says which of them are the action and the state
+    listed    every episode with frames, in the order of their ids; `episodes` are those that are not left out
+    files     the data files to read, each once, in the order of their first episode
+    tasks     task_index → words
+    """
 
     folder: Path
     fps: float
     robot_type: str | None
     features: Mapping[str, Feature]
+    roles: Roles
+    listed: tuple[EpisodeEntry, ...]
     episodes: tuple[EpisodeEntry, ...]
+    files: tuple[str, ...]
     tasks: Mapping[int, str]
     cameras: tuple[Camera, ...]
     warnings: tuple[str, ...]
 
     @property
-    def files(self) -> tuple[str, ...]:
-        """The data files, each once, in the order of their first episode."""
-        return tuple(dict.fromkeys(entry.file for entry in self.episodes))
+    def has_places(self) -> bool:
+        """Whether meta/ says in which file each episode is."""
+        return self.listed[0].file is not None
+
+    @property
+    def in_files(self) -> list[EpisodeEntry]:
+        """The listed episodes in the order in which the files that are read should hold them."""
+        if not self.has_places:
+            return list(self.listed)
+        inside: dict[str, list[EpisodeEntry]] = {file: [] for file in self.files}
+        for entry in self.listed:
+            inside.get(entry.file, []).append(entry)
+        return [entry for file in self.files for entry in inside[file]]
 
 
 @dataclass(frozen=True)
@@ -71,19 +98,23 @@ class _Info:
         return self.folder / INFO
 
 
-def read_layout(folder: Path) -> Layout:
+def read_layout(folder: Path, choice: ColumnChoice = AS_RECORDED) -> Layout:
     """Read meta/.
 
     Raises:
         DatasetError: no such folder, not a LeRobot data set, or meta/ contradicts itself.
+        ConfigError: the choice names a feature or an episode that does not exist, or leaves nothing over.
     """
     content = _content(folder)
     major, version_notes = _major(folder, content)
     info = _Info(folder, content, major)
     declared = _declared(info)
-    features, feature_notes = _features(info, declared)
+    features, feature_notes = _features(info, declared, choice)
+    joined = [name for name in choice.features if name not in features]
+    roles = choose_roles([*features, *joined], choice, str(folder))
     rows = _episode_rows(info)
-    episodes, episode_notes = _episodes(info, rows)
+    listed, episode_notes = _episodes(info, rows)
+    episodes = _without(listed, choice.exclude, folder)
     cameras = tuple(
         read_camera(folder, key, feature, content.get("video_path"), _video_places(info, key, rows))
         for key, feature in declared.items()
@@ -95,10 +126,13 @@ def read_layout(folder: Path) -> Layout:
         fps=_fps(info),
         robot_type=robot if isinstance(robot, str) and robot else None,
         features=features,
+        roles=roles,
+        listed=listed,
         episodes=episodes,
+        files=_files(folder, episodes),
         tasks=_tasks(info),
         cameras=cameras,
-        warnings=(*version_notes, *feature_notes, *episode_notes),
+        warnings=(*version_notes, *roles.notes, *feature_notes, *episode_notes),
     )
 
 
@@ -146,24 +180,25 @@ def _fps(info: _Info) -> float:
 
 
 def _declared(info: _Info) -> dict[str, dict[str, Any]]:
-    """`features` of info.json, each with a dtype and a shape of positive whole numbers; action and state among them."""
+    """`features` of info.json, each with a dtype and a shape of positive whole numbers (pictures may have another)."""
     features = info.content.get("features")
     if not isinstance(features, dict):
         raise DatasetError(f"{info.path}: 'features' is missing. It gives each column its dtype and shape.")
     for key, feature in features.items():
+        if isinstance(feature, dict) and isinstance(shape := feature.get("shape"), int) and not isinstance(shape, bool):
+            feature["shape"] = [shape]
+        if _is_picture(feature) and not _has_dtype_and_shape(feature):
+            feature["shape"] = []
         if not _has_dtype_and_shape(feature):
             raise DatasetError(
                 f"{info.path}: feature '{key}' needs a dtype and a shape of whole numbers above 0, "
                 f"got {str(feature)[:120]}. Correct it."
             )
-    for key in (ACTION, STATE):
-        if key not in features:
-            known = ", ".join(name for name in features if name not in INDEX_COLUMNS) or "none"
-            raise DatasetError(
-                f"{info.folder} has no feature '{key}', which every policy here needs. It has: {known}. "
-                "Rename the feature in meta/ and data/, or use another data set."
-            )
     return features
+
+
+def _is_picture(feature: Any) -> bool:
+    return isinstance(feature, dict) and feature.get("dtype") in ("video", "image")
 
 
 def _has_dtype_and_shape(feature: Any) -> bool:
@@ -173,15 +208,17 @@ def _has_dtype_and_shape(feature: Any) -> bool:
     return isinstance(shape, list) and all(isinstance(n, int) and not isinstance(n, bool) and n > 0 for n in shape)
 
 
-def _features(info: _Info, declared: dict[str, dict[str, Any]]) -> tuple[dict[str, Feature], list[str]]:
+def _features(
+    info: _Info, declared: dict[str, dict[str, Any]], choice: ColumnChoice
+) -> tuple[dict[str, Feature], list[str]]:
     """The features made of numbers, and notes on what is left out."""
     features, notes = {}, []
     for key, feature in declared.items():
         dtype, width = feature["dtype"], math.prod(feature["shape"])
-        if key in INDEX_COLUMNS or dtype in ("video", "image"):
+        if key in INDEX_COLUMNS or _is_picture(feature):
             continue
         if dtype not in _NUMBERS or width > MAX_WIDTH:
-            if key in (ACTION, STATE):
+            if key in (choice.action or ACTION, *(choice.state or (STATE,))):
                 raise DatasetError(
                     f"{info.path}: '{key}' is {dtype} {feature['shape']}; expected numbers, at most {MAX_WIDTH} a "
                     "frame. Correct meta/info.json, or record the feature as numbers."
@@ -226,13 +263,21 @@ def _places_an_episode(column: str) -> bool:
 
 
 def _episodes(info: _Info, rows: list[dict[str, Any]]) -> tuple[tuple[EpisodeEntry, ...], list[str]]:
-    listed = sorted((_entry(info, row) for row in rows), key=lambda entry: entry.id)
+    has_places = info.major == "2" or all(row.get("data/file_index") is not None for row in rows)
+    entries = [_entry(info, row, has_places) for row in rows]
+    listed = sorted(dict.fromkeys(entries), key=lambda entry: entry.id)
     for one, other in pairwise(listed):
         if one.id == other.id:
-            raise DatasetError(f"{info.folder}: meta/ lists episode {one.id} twice. Remove one of the two rows.")
+            raise DatasetError(
+                f"{info.folder}: meta/ lists episode {one.id} twice, and not alike. Remove one of the two rows."
+            )
     episodes = tuple(entry for entry in listed if entry.length)
     empty = ", ".join(str(entry.id) for entry in listed if not entry.length)
     notes = [f"Episodes without frames were left out: {empty}."] if empty else []
+    if len(listed) < len(entries):
+        notes.append("meta/ lists some episodes several times, each time alike; they count once.")
+    if not has_places:
+        notes.append("meta/ does not say in which file each episode is; all files of data/ were read.")
     found = {"total_episodes": len(listed), "total_frames": sum(entry.length for entry in listed)}
     for key, count in found.items():
         if (said := info.content.get(key)) != count:
@@ -240,14 +285,39 @@ def _episodes(info: _Info, rows: list[dict[str, Any]]) -> tuple[tuple[EpisodeEnt
     return episodes, notes
 
 
-def _entry(info: _Info, row: dict[str, Any]) -> EpisodeEntry:
+def _without(listed: tuple[EpisodeEntry, ...], exclude: tuple[int, ...], folder: Path) -> tuple[EpisodeEntry, ...]:
+    """The episodes that are not left out."""
+    known = {entry.id for entry in listed}
+    for number in exclude:
+        if number not in known:
+            raise ConfigError(
+                f"exclude names the episode {number}, which {folder} does not have; its {len(known)} episodes are numbered "
+                f"{listed[0].id} to {listed[-1].id}. Take it from the list."
+            )
+    left = tuple(entry for entry in listed if entry.id not in set(exclude))
+    if not left:
+        raise ConfigError(f"exclude leaves out all {len(known)} episodes of {folder}. Leave at least one in.")
+    return left
+
+
+def _files(folder: Path, episodes: tuple[EpisodeEntry, ...]) -> tuple[str, ...]:
+    """The files of the episodes, or all there are, in LeRobot's order, where meta/ does not say."""
+    named = tuple(dict.fromkeys(entry.file for entry in episodes if entry.file is not None))
+    found = named or sorted(path.relative_to(folder).as_posix() for path in (folder / "data").glob("*/*.parquet"))
+    if not found:
+        raise DatasetError(f"{folder}/data holds no */*.parquet: the frames are missing. Copy the data set again.")
+    return tuple(found)
+
+
+def _entry(info: _Info, row: dict[str, Any], has_place: bool) -> EpisodeEntry:
     template = info.content.get("data_path")
     if not isinstance(template, str):
         raise DatasetError(
             f'{info.path}: data_path is {template!r}; expected a path such as "data/chunk-{{chunk_index:03d}}/…".'
         )
-    file = fill(template, _path_fields(info, row, "data"))
-    inside(info.folder, file)
+    file = fill(template, _path_fields(info, row, "data")) if has_place else None
+    if file is not None:
+        inside(info.folder, file)
     tasks = row.get("tasks")
     words = ("; ".join(map(str, tasks)) if isinstance(tasks, list) else str(tasks)) if tasks else None
     return EpisodeEntry(_whole(info, row, "episode_index"), _whole(info, row, "length"), file, words)
@@ -279,15 +349,14 @@ def _whole(info: _Info, row: dict[str, Any], key: str) -> int:
 
 def _tasks(info: _Info) -> dict[int, str]:
     """task_index → words; empty where the file is absent (episodes usually carry their task in words as well)."""
-    file = "meta/tasks.jsonl" if info.major == "2" else "meta/tasks.parquet"
-    if not (info.folder / file).exists():
-        return {}
-    if info.major == "2":
-        rows = read_json_lines(info.folder, file)
+    if info.major == "3" and (info.folder / "meta/tasks.parquet").exists():
+        columns = read_table(info.folder, "meta/tasks.parquet").to_pydict()
+        numbers = columns.pop("task_index", None)
+        words = columns.get("task") or next(iter(columns.values()), [])  # the index of a pandas frame, named or not
+        pairs = list(zip(range(len(words)) if numbers is None else numbers, words, strict=False))
+    elif (info.folder / "meta/tasks.jsonl").exists():
+        rows = read_json_lines(info.folder, "meta/tasks.jsonl")
         pairs = [(row.get("task_index"), row.get("task")) for row in rows]
     else:
-        columns = read_table(info.folder, file).to_pydict()
-        numbers = columns.pop("task_index", [])
-        words = columns.get("task") or next(iter(columns.values()), [])  # the index of a pandas frame, named or not
-        pairs = list(zip(numbers, words, strict=False))
+        return {}
     return {number: str(word) for number, word in pairs if isinstance(number, int) and word is not None}

@@ -58,8 +58,8 @@ def resolve_semantics(
         warnings=(
             *doubts,
             *_circular_warnings(demonstrations, turns, found=circular is None),
-            *_dead_warnings(demonstrations),
-            *_clock_warnings(demonstrations),
+            *dead_warnings(demonstrations),
+            *clock_warnings(demonstrations),
         ),
     )
 
@@ -187,7 +187,8 @@ def dead_columns(demonstrations: Demonstrations, feature: str, frames: np.ndarra
     return (deviation == 0) | (deviation < DEAD * usual)
 
 
-def _dead_warnings(demonstrations: Demonstrations) -> list[str]:
+def dead_warnings(demonstrations: Demonstrations) -> list[str]:
+    """Columns of actions and states that hardly move."""
     warnings = []
     for key in (ACTION, STATE):
         names = demonstrations.features[key].names
@@ -218,7 +219,7 @@ def _circular_warnings(
     return warnings
 
 
-def _clock_warnings(demonstrations: Demonstrations) -> list[str]:
+def clock_warnings(demonstrations: Demonstrations) -> list[str]:
     """Where the recorded clock is not what fps says: horizons in seconds are then nominal."""
     first = steps_of(demonstrations).first
     seconds = np.diff(demonstrations.timestamps)[first]
@@ -260,6 +261,8 @@ def inspect_dataset(demonstrations: Demonstrations, semantics: Semantics) -> dic
         "features": [_feature_summary(demonstrations, semantics, key) for key in demonstrations.features],
         "cameras": [vars(camera) for camera in demonstrations.cameras],
         "tasks": dict(Counter(demonstrations.tasks).most_common()),
+        "episode_tasks": list(demonstrations.tasks),
+        "excluded": list(demonstrations.excluded),
         "warnings": [*demonstrations.warnings, *semantics.warnings],
     }
 

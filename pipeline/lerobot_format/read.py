@@ -1,119 +1,130 @@
 """A source → Demonstrations.
 
-What belongs here: putting frames and meta/ together, and every check between them: an error where a difference would
-make a number wrong, a warning where not. What does not: what columns mean (quality.py), downloading (hub.py).
+What belongs here: the steps from files to columns, and the last checks of their numbers. What does not: which row is which
+frame (placing.py), which feature plays which part (columns.py), what columns mean (quality.py), downloading (hub.py).
 """
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.errors import DatasetError
+from pipeline.experiment import Experiment
+from pipeline.lerobot_format.archives import is_archive, unpacked
+from pipeline.lerobot_format.columns import arrange, set_units
 from pipeline.lerobot_format.frames import Frames, read_frames
+from pipeline.lerobot_format.joined import check_names, join_feature, stamp_of_features
 from pipeline.lerobot_format.layout import Layout, read_layout
+from pipeline.lerobot_format.placing import Places, place_frames
+from pipeline.lerobot_format.quality import resolve_semantics
 from pipeline.lerobot_format.saved import hash_demonstrations, load_demonstrations, save_demonstrations
-from pipeline.types import ACTION, Demonstrations
+from pipeline.types import AS_RECORDED, ColumnChoice, Demonstrations, Feature, Semantics
 
-__all__ = ["load_demonstrations", "load_source", "read_dataset", "save_demonstrations", "source_stamp"]
+__all__ = [
+    "check_experiment", "load_demonstrations", "load_experiment", "load_source", "read_dataset", "save_demonstrations",
+    "source_folder", "source_stamp",
+]  # fmt: skip
 
 EMBEDDED, HUB = "embedded:", "hub:"
 
 
 def read_dataset(
-    folder: Path, *, name: str, source: str | None = None, revision: str | None = None, videos_expected: bool = True
+    folder: Path,
+    *,
+    name: str,
+    source: str | None = None,
+    revision: str | None = None,
+    videos_expected: bool = True,
+    choice: ColumnChoice = AS_RECORDED,
 ) -> Demonstrations:
     """Read a LeRobot folder (v2.0, v2.1, v3.0) into memory. Pictures and videos are never read.
 
-    `videos_expected=False` says that absent videos are no fault (a download without them).
+    `videos_expected=False` says that absent videos are no fault (a download without them). `choice` says which features are
+    the action and the state, what is joined to them, and which episodes are left out.
 
     Raises:
         DatasetError: the folder cannot be read, or a number made from it would be wrong.
+        ConfigError: the choice names something that does not exist.
     """
-    layout = read_layout(folder)
+    layout = read_layout(folder, choice)
+    check_names(choice.features, layout.features)
     frames = read_frames(layout)
-    starts = _episode_starts(layout, frames)
-    _check_numbers(layout, frames, starts)
-    timestamps, clock_notes = _timestamps(layout, frames, starts)
+    places = place_frames(layout, frames)
+    timestamps, clock_notes = _timestamps(layout, frames, places)
+    tasks = _tasks(layout, frames, places)
+    columns, features = _columns(layout, frames, places, choice)
     arrays = {
-        "episode_starts": starts,
-        "episode_ids": np.array([entry.id for entry in layout.episodes], np.int64),
+        "episode_starts": places.starts,
+        "episode_ids": _ids(layout),
         "timestamps": timestamps,
-        "tasks": _tasks(layout, frames, starts),
+        "tasks": tasks,
     }
-    features = {key: layout.features[key] for key in frames.columns}
+    warnings = (*layout.warnings, *frames.warnings, *places.notes, *clock_notes)
     return Demonstrations(
         name=name,
         source=source if source is not None else str(folder),
         revision=revision,
         fps=layout.fps,
         robot_type=layout.robot_type,
-        columns=frames.columns,
+        columns=columns,
         features=features,
         cameras=layout.cameras,
-        warnings=(*layout.warnings, *frames.warnings, *clock_notes, *_absent_videos(layout, videos_expected)),
-        content_hash=hash_demonstrations(frames.columns, features, fps=layout.fps, **arrays),
+        warnings=(*warnings, *_absent_videos(layout, videos_expected)),
+        content_hash=hash_demonstrations(columns, features, fps=layout.fps, **arrays),
+        excluded=choice.exclude,
         **arrays,
     )
 
 
-def _episode_starts(layout: Layout, frames: Frames) -> np.ndarray:
-    """[E + 1]; the frames are checked to be whole episodes, in order, one after another.
+def _ids(layout: Layout) -> np.ndarray:
+    return np.array([entry.id for entry in layout.episodes], np.int64)
 
-    The lists in meta/ give the lengths (`read_frames` has compared the totals of each file); index columns, where they
-    are there, must agree.
-    """
-    lengths = np.array([entry.length for entry in layout.episodes], np.int64)
-    starts = np.concatenate([[0], np.cumsum(lengths)])
-    ids = np.repeat([entry.id for entry in layout.episodes], lengths)
-    files = {file: position for position, file in enumerate(layout.files)}
-    expected_file = np.repeat([files[entry.file] for entry in layout.episodes], lengths)
-    if (expected_file != frames.file_of).any():
-        raise DatasetError(
-            f"{layout.folder}: meta/ spreads consecutive episodes over files out of order. Sort the episodes by file."
+
+def _columns(
+    layout: Layout, frames: Frames, places: Places, choice: ColumnChoice
+) -> tuple[dict[str, np.ndarray], dict[str, Feature]]:
+    """What the benchmark sees: the recorded columns with those joined, `action` and `observation.state` among them."""
+    columns, features = {}, {key: layout.features[key] for key in frames.columns}
+    for key in features:
+        columns[key] = places.take(frames.columns.pop(key))  # one at a time: a copy of all would double the memory
+    _check_numbers(layout, columns, features, places.starts)
+    for key, path in choice.features.items():
+        features[key], columns[key] = join_feature(
+            key, path, ids=_ids(layout), starts=places.starts, excluded=choice.exclude
         )
-    if frames.episode_id is not None and (frames.episode_id != ids).any():
-        frame = int(np.flatnonzero(frames.episode_id != ids)[0])
-        raise DatasetError(
-            f"{layout.folder / layout.files[frames.file_of[frame]]}: frame {frame} of the data set belongs to episode "
-            f"{frames.episode_id[frame]}, but the lengths that meta/ lists put it in episode {ids[frame]}. "
-            "Episodes must lie one after another with the listed lengths: correct the list, or copy the data set again."
-        )
-    if frames.frame_index is not None:
-        expected = np.arange(starts[-1]) - np.repeat(starts[:-1], lengths)
-        if (frames.frame_index != expected).any():
-            frame = int(np.flatnonzero(frames.frame_index != expected)[0])
-            raise DatasetError(
-                f"{layout.folder}: episode {ids[frame]} has frame_index {frames.frame_index[frame]} where "
-                f"{expected[frame]} was expected: frames are missing or out of order. "
-                "Sort the frames, or record the episode again."
-            )
-    return starts
+    columns, features = arrange(columns, features, layout.roles)
+    return columns, set_units(features, choice.units)
 
 
-def _check_numbers(layout: Layout, frames: Frames, starts: np.ndarray) -> None:
+def _check_numbers(
+    layout: Layout, columns: Mapping[str, np.ndarray], features: Mapping[str, Feature], starts: np.ndarray
+) -> None:
     """Actions and observations are finite."""
-    for key, values in frames.columns.items():
-        if key != ACTION and not key.startswith("observation."):
+    for key, values in columns.items():
+        if key not in layout.roles.needed and not key.startswith("observation."):
             continue
         if np.isfinite(values).all():
             continue
         frame, column = map(int, np.argwhere(~np.isfinite(values))[0])
         episode = int(np.searchsorted(starts, frame, side="right")) - 1
+        number = layout.episodes[episode].id
         raise DatasetError(
-            f"{layout.folder}: {key} is {values[frame, column]} in episode {layout.episodes[episode].id}, frame "
-            f"{frame - starts[episode]}, column '{layout.features[key].names[column]}'; expected a finite number. "
-            "Remove the episode, or repair the recording."
+            f"{layout.folder}: {key} is {values[frame, column]} in episode {number}, frame "
+            f"{frame - starts[episode]}, column '{features[key].names[column]}'; expected a finite number. "
+            f"Leave the episode out (exclude = [{number}]), or repair the recording."
         )
 
 
-def _timestamps(layout: Layout, frames: Frames, starts: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _timestamps(layout: Layout, frames: Frames, places: Places) -> tuple[np.ndarray, list[str]]:
     """[N] seconds from the start of the episode, derived from fps where there are none."""
+    starts = places.starts
     lengths = np.diff(starts)
     if frames.timestamps is None:
         return (np.arange(starts[-1]) - np.repeat(starts[:-1], lengths)) / layout.fps, []
-    stamps = frames.timestamps
+    stamps = places.take(frames.timestamps)
     if not np.isfinite(stamps).all():
         frame = int(np.flatnonzero(~np.isfinite(stamps))[0])
         raise DatasetError(f"{layout.folder}: the timestamp of frame {frame} is {stamps[frame]}; expected seconds.")
@@ -130,13 +141,14 @@ def _timestamps(layout: Layout, frames: Frames, starts: np.ndarray) -> tuple[np.
     return stamps, notes
 
 
-def _tasks(layout: Layout, frames: Frames, starts: np.ndarray) -> tuple[str, ...]:
+def _tasks(layout: Layout, frames: Frames, places: Places) -> tuple[str, ...]:
     """The task of each episode in words: from meta/, else by the `task_index` of its first frame."""
+    index = None if frames.task_index is None else places.take(frames.task_index)
     words = []
     for position, entry in enumerate(layout.episodes):
         task = entry.task
-        if task is None and frames.task_index is not None:
-            task = layout.tasks.get(int(frames.task_index[starts[position]]))
+        if task is None and index is not None:
+            task = layout.tasks.get(int(index[places.starts[position]]))
         words.append(task or "")
     return tuple(words)
 
@@ -151,27 +163,50 @@ def _absent_videos(layout: Layout, expected: bool) -> list[str]:
     ]
 
 
-def load_source(source: str, *, name: str, config_dir: Path, videos: bool = False) -> Demonstrations:
-    """Read what `source` in demobench.toml means: `embedded:‹name›`, `hub:‹owner/name›[@revision]`, or a folder.
+def load_source(
+    source: str, *, name: str, config_dir: Path, videos: bool = False, choice: ColumnChoice = AS_RECORDED
+) -> Demonstrations:
+    """Read what `source` in demobench.toml means: `embedded:‹name›`, `hub:‹owner/name›[@revision]`, a folder or a .zip.
 
-    A relative folder is relative to `config_dir`. `videos` asks for the videos of a Hub data set as well.
+    A relative path is relative to `config_dir`. `videos` asks for the videos of a Hub data set as well.
 
     Raises:
         DatasetError: it cannot be read; HubError where the Hub is the reason.
+        ConfigError: the choice names something that does not exist.
     """
     if source.startswith(EMBEDDED):
         from pipeline.embedded import embedded_folder
 
-        return read_dataset(embedded_folder(source.removeprefix(EMBEDDED)), name=name, source=source)
+        return read_dataset(embedded_folder(source.removeprefix(EMBEDDED)), name=name, source=source, choice=choice)
     if source.startswith(HUB):
         from pipeline.lerobot_format.hub import fetch
 
         copy = fetch(source.removeprefix(HUB), videos=videos)
         demonstrations = read_dataset(
-            copy.folder, name=name, source=source, revision=copy.commit, videos_expected=videos
+            copy.folder, name=name, source=source, revision=copy.commit, videos_expected=videos, choice=choice
         )
         return _with_warnings(demonstrations, copy.warnings)
-    return read_dataset(_folder(source, config_dir), name=name, source=source)
+    return read_dataset(source_folder(source, config_dir), name=name, source=source, choice=choice)
+
+
+def load_experiment(experiment: Experiment, config_dir: Path) -> tuple[Demonstrations, Semantics]:
+    """The demonstrations that an experiment is about, read from their source, and what their columns mean.
+
+    Raises:
+        DatasetError, ConfigError: as `load_source` and `resolve_semantics`.
+    """
+    dataset = experiment.dataset
+    demos = load_source(dataset.source, name=experiment.name, config_dir=config_dir, choice=dataset.choice(config_dir))
+    return demos, resolve_semantics(demos, kind=dataset.kind, circular=dataset.circular)
+
+
+def check_experiment(experiment: Experiment, config_dir: Path) -> None:
+    """Fail in a moment, before any work, where the source is not there or is no data set (the Hub is not asked)."""
+    dataset = experiment.dataset
+    source_stamp(dataset.source, config_dir)
+    stamp_of_features(dataset.choice(config_dir).features)
+    if not dataset.source.startswith((EMBEDDED, HUB)):
+        read_layout(source_folder(dataset.source, config_dir), dataset.choice(config_dir))
 
 
 def _with_warnings(demonstrations: Demonstrations, more: tuple[str, ...]) -> Demonstrations:
@@ -180,7 +215,17 @@ def _with_warnings(demonstrations: Demonstrations, more: tuple[str, ...]) -> Dem
     return replace(demonstrations, warnings=(*demonstrations.warnings, *more)) if more else demonstrations
 
 
-def _folder(source: str, config_dir: Path) -> Path:
+def source_folder(source: str, config_dir: Path) -> Path:
+    """The folder that a path means; of a .zip that of its unpacked copy.
+
+    Raises:
+        DatasetError: it is a URL, or not there, or an archive that cannot be unpacked.
+    """
+    path = _path(source, config_dir)
+    return unpacked(path) if is_archive(path) else path
+
+
+def _path(source: str, config_dir: Path) -> Path:
     if "://" in source:
         raise DatasetError(
             f"The source '{source}' is a URL. Give a folder, hub:owner/name[@revision], or embedded:pusht_sim."
@@ -196,8 +241,9 @@ def _folder(source: str, config_dir: Path) -> Path:
 def source_stamp(source: str, config_dir: Path) -> dict[str, Any]:
     """What makes a source stale, found without reading it: JSON-able, equal while nothing has changed.
 
-    Folder: its path and a digest of the paths, sizes and times of its files. Hub: the commit that the revision stands
-    for now (as the cache last saw it where the Hub is out of reach). Embedded: the bytes themselves, which are few.
+    Folder: its path and a digest of the paths, sizes and times of its files. Archive: its path, size and time. Hub: the
+    commit that the revision stands for now (as the cache last saw it where the Hub is out of reach). Embedded: the bytes
+    themselves, which are few.
 
     Raises:
         DatasetError: no such folder or name.
@@ -222,7 +268,11 @@ def source_stamp(source: str, config_dir: Path) -> dict[str, Any]:
             "revision": revision,
             "commit": current_commit(repository, revision),
         }
-    folder = _folder(source, config_dir)
+    folder = _path(source, config_dir)
+    if is_archive(folder):
+        stat = folder.stat()
+        path = str(folder.resolve())
+        return {"kind": "zip", "path": path, "bytes": stat.st_size, "modified_ns": stat.st_mtime_ns}
     if not folder.is_dir():
         read_layout(folder)  # its message says what is wrong
     digest, count, size = hashlib.sha256(), 0, 0

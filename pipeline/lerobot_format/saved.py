@@ -70,6 +70,7 @@ def save_demonstrations(demonstrations: Demonstrations, folder: Path) -> None:
         "cameras": [vars(camera) for camera in demonstrations.cameras],
         "warnings": demonstrations.warnings,
         "content_hash": demonstrations.content_hash,
+        "excluded": demonstrations.excluded,
     }
     (folder / _META).write_text(json.dumps(meta, indent=1, ensure_ascii=False), encoding="utf-8")
 
@@ -101,6 +102,7 @@ def load_demonstrations(folder: Path) -> Demonstrations:
             tasks=tuple(meta["tasks"]),
             cameras=tuple(Camera(**camera) for camera in meta["cameras"]),
             warnings=tuple(meta["warnings"]),
+            excluded=tuple(meta.get("excluded", ())),
             **arrays,
         )
     except (OSError, ValueError, KeyError, TypeError) as error:

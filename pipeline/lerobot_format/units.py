@@ -30,6 +30,12 @@ def usual_range(unit: str | None) -> float | None:
     return _USUAL_RANGE.get(unit) if unit else None
 
 
+def canonical_unit(unit: str) -> str:
+    """A unit as it is written here: `degrees` → deg; a word that is not known stays as it is."""
+    word = unit.strip()
+    return _UNITS.get(word.lower(), word)
+
+
 def unit_of(name: str) -> str | None:
     """The unit that a column's name ends in: `block_x_px` → px, `wrist.vel_deg_s` → deg/s, `elbow_flex.pos` → None."""
     words = [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word]

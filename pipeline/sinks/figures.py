@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.methods import METHODS
 from pipeline.sinks import bracket_chart, charts, planes
-from pipeline.sinks.findings import LOSSES, ahead, bracket_of, capital, floors_of, name_in, not_above, why_not
+from pipeline.sinks.findings import LOSSES, ahead, bracket_of, capital, floors_of, name_in, not_above, ranks, why_not
 from pipeline.sinks.words import common_unit, show
 from pipeline.types import ACTION, STATE, Demonstrations, Predictions, RadiusFloor, Rollouts, Semantics
 
@@ -85,7 +85,7 @@ def _asks_observations(row: Row) -> bool:
 def best_predictions(table: Mapping[str, Any], predictions: Sequence[Predictions]) -> Predictions | None:
     """Those of the trained policy with the lowest first-step error; of any policy where none was trained."""
     known = {(one.policy, one.observations): one for one in predictions if len(one.anchors)}
-    rows = [row for row in table["policies"] if (row["policy"], row["observations"]) in known]
+    rows = [row for row in table["policies"] if (row["policy"], row["observations"]) in known and ranks(row)]
     trained = [row for row in rows if row["method"] not in METHODS or METHODS[row["method"]].trained]
     ranked = sorted(trained or rows, key=lambda row: np.nan_to_num(row["first_step_mae"] or np.inf, nan=np.inf))
     return known[ranked[0]["policy"], ranked[0]["observations"]] if ranked else None

@@ -7,7 +7,7 @@ tests. Nothing here calls one policy better than another unless a comparison of 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.methods import METHODS
+from pipeline.methods import EXTERNAL, METHODS
 from pipeline.sinks.words import common_unit, decimals_for, is_number, plural, show, show_interval
 
 Table = Mapping[str, Any]
@@ -34,12 +34,13 @@ Sentence = list[str]
 
 def answer(table: Table) -> list[Sentence]:
     """What a reader wants to know first, each with the test or the floor that carries it."""
-    rows = [row for row in table["policies"] if is_number(row["first_step_mae"])]
+    rows = [row for row in table["policies"] if is_number(row["first_step_mae"]) and ranks(row)]
     found = []
     if rows:
         best = min(rows, key=lambda row: row["first_step_mae"])
         found = [_best(table, best), *_second(table, rows, best), *_against_still(table, rows, best)]
         found += [*_against_champion(table, rows), *_first_step_floor(table, best), *_later_floor(table, best)]
+    found += [_from_elsewhere(table, row) for row in table["policies"] if is_elsewhere(row)]
     driven = [row for row in table["policies"] if row["rollouts"]]
     return [*found, _best_driven(driven)] if driven else found
 
@@ -64,6 +65,55 @@ def who(row: Row) -> Sentence:
     return [Strong(row["policy"]), f" seeing {row['observations']}" if asks else ""]
 
 
+def is_elsewhere(row: Row) -> bool:
+    """Whether a row was predicted elsewhere, and only scored here."""
+    return row["method"] == EXTERNAL
+
+
+def is_seen(row: Row) -> bool:
+    """Whether a row is scored on what its policy was trained on."""
+    return bool(row.get("seen_in_training"))
+
+
+def ranks(row: Row) -> bool:
+    """Whether a row's error can stand beside the others': those from elsewhere have episodes of their own."""
+    return not is_elsewhere(row)
+
+
+def _from_elsewhere(table: Table, row: Row) -> Sentence:
+    """What is known of a row that was predicted elsewhere."""
+    value = f"{show(row['first_step_mae'])}{dataset_unit(table)}"
+    said: Sentence = [Strong(row["policy"]), ", predicted elsewhere, has a first-step error of ", Strong(value)]
+    said.append(f" on {plural(len(row['episodes']), 'episode')}")
+    if is_seen(row):
+        return [*said, " that it was ", Strong("trained on"), ", which says nothing about others: no verdict."]
+    found = compared(table, address(row), "hold_still")
+    if found is None:
+        return [*said, "."]
+    if found["word"] in ("better", "worse"):
+        word = Strong(f"{found['word']} than hold-still")
+        return [*said, "; it is ", word, f" on those that both hold out: {found['words']}."]
+    if found["word"] == "not comparable":
+        return [*said, f". It cannot be compared with hold-still: {found['words']}."]
+    return [*said, "; it ", Strong("cannot be told from hold-still"), f": {found['words']}."]
+
+
+def elsewhere_words(table: Table) -> list[str]:
+    """What rows from elsewhere rest on, and what looks odd about them."""
+    found = []
+    for row in (row for row in table["policies"] if is_elsewhere(row)):
+        found.append(f"{row['policy']}: {row['training']}")
+        found += [f"{row['policy']}: {warning}" for warning in row["warnings"]]
+        if row["samples"]:
+            energy, one = (row["samples"][name]["value"] for name in ("energy", "of_one"))
+            unit = " deviations" if row["samples"]["in_deviations"] else dataset_unit(table)
+            found.append(
+                f"{row['policy']}: errors are of the mean of {row['samples']['count']} samples; one sample is {show(one)}{unit} "
+                f"off (L2), fair energy score {show(energy)}"
+            )
+    return found
+
+
 def champion(table: Table) -> str | None:
     """The address of the champion, its name where it has no row, or None where none was named."""
     if not any(row["verdict"]["vs_champion"] for row in table["policies"]):
@@ -84,8 +134,10 @@ def compared(table: Table, a: str, b: str, metric: str = "first_step_mae") -> Ma
 
 
 def family(table: Table) -> int:
-    """How many comparisons were tested, and so share one correction."""
-    return sum(comparison["p_holm"] is not None for comparison in table["comparisons"])
+    """How many comparisons of our rows were tested, and so share one correction; each row from elsewhere has its own."""
+    elsewhere = {address(row) for row in table["policies"] if is_elsewhere(row)}
+    tested = [c for c in table["comparisons"] if c["p_holm"] is not None]
+    return sum(comparison["a"] not in elsewhere for comparison in tested)
 
 
 def dataset_unit(table: Table) -> str:
@@ -315,6 +367,8 @@ def families_words(table: Table) -> str:
     if not number:
         return "No difference was tested: a verdict needs at least five held-out episodes."
     together = f"{plural(number, 'comparison')} in one family" if number > 1 else "One comparison"
+    if any(is_elsewhere(row) for row in table["policies"]):
+        together += ", those of each row from elsewhere in one of its own"
     return f"{together}; a verdict needs p ≤ 0.05 after Holm's correction."
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pipeline.sinks.findings import MARKS, address, champion, first_step_gap, gap_parts
+from pipeline.sinks.findings import MARKS, address, champion, first_step_gap, gap_parts, is_seen, ranks
 from pipeline.sinks.markup import Html, element, join
 from pipeline.sinks.palette import is_baseline
 from pipeline.sinks.report_sections import verdict
@@ -56,7 +56,8 @@ def benchmark_table(table: Mapping[str, Any]) -> Html:
 def _name_cell(row: Row) -> Html:
     """A policy with its colour; narrow screens show the observation set here and hide that column."""
     swatch = element("span", class_="swatch", data_policy=row["policy"], aria_hidden="true")
-    return element("th", swatch, row["policy"], element("small", row["observations"]), class_="name", scope="row")
+    name = f"{row['policy']} (seen in training)" if is_seen(row) else row["policy"]
+    return element("th", swatch, name, element("small", row["observations"]), class_="name", scope="row")
 
 
 def _columns(table: Mapping[str, Any]) -> list[Column]:
@@ -137,7 +138,7 @@ def _head(title: str, below: str, class_: str | None = None) -> Html:
 def _best(column: Column, rows: Sequence[Row]) -> Any:
     if column.better is None:
         return None
-    values = [value for row in rows if is_number(value := column.value(row))]
+    values = [value for row in rows if ranks(row) and is_number(value := column.value(row))]
     if len(set(values)) < 2:
         return None
     return min(values) if column.better == "low" else max(values)

@@ -70,8 +70,13 @@ def test_a_list_of_episodes_with_impossible_numbers(message: Message, v2: Path, 
 
 def test_an_episode_that_is_listed_twice(message: Message, v2: Path):
     path = v2 / "meta/episodes.jsonl"
-    path.write_text(path.read_text() * 2)
-    assert "lists episode 0 twice" in message(v2)
+    listed = path.read_text()
+    path.write_text(listed * 2)
+    read = read_dataset(v2, name="set")
+    assert read.episodes == 4
+    assert "meta/ lists some episodes several times, each time alike; they count once." in read.warnings
+    path.write_text(listed + json.dumps({"episode_index": 0, "tasks": [], "length": 3}))
+    assert "lists episode 0 twice, and not alike" in message(v2)
 
 
 def test_zero_episodes_v2(message: Message, v2: Path):
@@ -89,39 +94,66 @@ def test_zero_episodes_v3(message: Message, v3: Path):
 
 @pytest.mark.parametrize("length", [19, 21, 1])
 def test_lengths_that_contradict_the_data(message: Message, v2: Path, length: int):
+    """The frames' own numbers are two witnesses against the list; without them nothing tells who is right."""
     path = v2 / "meta/episodes.jsonl"
     rows = [json.loads(line) for line in path.read_text().splitlines()]
     rows[2]["length"] = length
     path.write_text("\n".join(map(json.dumps, rows)))
+    read = read_dataset(v2, name="set")
+    assert read.lengths.tolist() == [20] * 4
+    assert f"(2: {length}, found 20); the data were believed." in " ".join(read.warnings)
+    for file in (v2 / "data").rglob("*.parquet"):
+        edit_table(file, lambda table: table.drop_columns(["episode_index", "frame_index"]))
     assert f"{V2_DATA} has 20 frames; the episodes that meta/ lists in it have {length}" in message(v2)
 
 
 def test_boundaries_that_contradict_the_data(message: Message, v3: Path):
-    """The total of the file is right, so only the frames' own episode numbers show it."""
+    """The total of the file is right, so only the frames' own numbers show it."""
+    truth = read_dataset(v3, name="set")
     edit_table(
         v3 / V3_EPISODES,
         lambda table: table.set_column(table.column_names.index("length"), "length", pa.array([19, 21, 20, 20])),
     )
-    assert (
-        "frame 19 of the data set belongs to episode 0, but the lengths that meta/ lists put it in episode 1"
-        in message(v3)
-    )
+    read = read_dataset(v3, name="set")
+    assert read.content_hash == truth.content_hash
+    assert "(0: 19, found 20, 1: 21, found 20); the data were believed." in " ".join(read.warnings)
+    edit_table(v3 / V3_DATA, lambda table: table.drop_columns(["frame_index"]))
+    assert "episode 0 has 20 frames, but meta/ lists 19" in message(v3)
 
 
 def test_frames_out_of_order(message: Message, v2: Path):
+    truth = read_dataset(v2, name="set")
     edit_table(v2 / V2_DATA, lambda table: table.take([*range(10), 11, 10, *range(12, 20)]))
-    assert "episode 2 has frame_index 11 where 10 was expected: frames are missing or out of order" in message(v2)
+    read = read_dataset(v2, name="set")
+    assert read.content_hash == truth.content_hash
+    assert "Frames lay out of order and were sorted by frame_index: episode 2." in read.warnings
+    edit_table(v2 / V2_DATA, lambda table: table.take([*range(10), 9, *range(11, 20)]))
+    assert "episode 2 has frame_index" in message(v2)
+    assert "frames are missing, twice or out of order" in message(v2)
 
 
 def test_files_in_another_order_than_their_episodes(message: Message, tmp_path: Path):
     folder = write_v3(tmp_path / "set", tiny_recording(4, 20), episodes_per_file=2)
+    truth = read_dataset(folder, name="set")
+    for file, numbers in (("file-000", [0, 2]), ("file-001", [1, 3])):
+        edit_table(
+            folder / f"data/chunk-000/{file}.parquet",
+            lambda table, numbers=numbers: table.set_column(
+                table.column_names.index("episode_index"), "episode_index", pa.array(np.repeat(numbers, 20))
+            ),
+        )
     edit_table(
         folder / V3_EPISODES,
         lambda table: table.set_column(
             table.column_names.index("data/file_index"), "data/file_index", pa.array([0, 1, 0, 1])
         ),
     )
-    assert "out of order" in message(folder)
+    read = read_dataset(folder, name="set")
+    np.testing.assert_array_equal(read.columns[ACTION][20:40], truth.columns[ACTION][40:60])
+    assert "The data files do not hold the episodes in order; they were sorted by episode_index." in read.warnings
+    for file in (folder / "data").rglob("*.parquet"):
+        edit_table(file, lambda table: table.drop_columns(["episode_index"]))
+    assert "the frames have no episode_index that would tell them apart" in message(folder)
 
 
 # Columns
@@ -229,7 +261,7 @@ def test_lists_that_would_fill_the_memory_are_refused_before_they_are_read(
     assert read_dataset(v2, name="set").episodes == 4
     replace_column(v2 / V2_DATA, ACTION, pa.array([[0.0] * 100_000] * 20, pa.list_(pa.float32())))
     assert (v2 / V2_DATA).stat().st_size < 100_000
-    assert "frames need" in message(v2)
+    assert "column 'action' has 100000 a frame; meta/info.json declares 2 numbers a frame" in message(v2)
 
 
 def test_a_column_that_is_there_twice(message: Message, v2: Path):

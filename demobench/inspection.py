@@ -1,0 +1,132 @@
+"""What `demobench inspect` prints: facts, columns, what looks wrong, the episodes to look at, and those to leave out.
+
+What does not belong here: finding anything (pipeline/inspection).
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from pipeline.inspection.finding import CHECKS
+
+WIDE = 24
+"""Columns of a feature that are listed one by one; more are one row."""
+
+SHOWN = 5
+"""Findings of one check that are printed; --json has all."""
+
+
+def show_inspection(facts: Mapping[str, Any], console: Console, said_by_checks: Sequence[str] = ()) -> None:
+    """`facts` are those of `quality.inspect_dataset` and `Inspection.as_json`; `said_by_checks` are warnings among them
+    that findings repeat.
+    """
+    _show_facts(facts, console)
+    console.print(_columns(facts))
+    for camera in facts["cameras"]:
+        there = "there" if camera["present"] else "declared, but its files are absent"
+        console.print(f"camera {escape(camera['key'])} {camera['width']}×{camera['height']}: {there}", soft_wrap=True)
+    for warning in facts["warnings"]:
+        if warning not in said_by_checks:
+            console.print(f"[yellow]note:[/] {escape(warning)}", soft_wrap=True)
+    console.print()
+    _show_findings(facts["findings"], console)
+    _show_episodes(facts, console)
+
+
+def _show_facts(facts: Mapping[str, Any], console: Console) -> None:
+    lengths, fps = facts["episode_length"], facts["fps"]
+    console.print(f"[bold]{escape(facts['name'])}[/]  {escape(facts['source'])}", soft_wrap=True)
+    revision = f" · revision {facts['revision'][:12]}" if facts["revision"] else ""
+    robot = f" · {escape(facts['robot_type'])}" if facts["robot_type"] else ""
+    console.print(
+        f"{facts['episodes']:,} episodes · {facts['frames']:,} frames · {fps:g} fps · {facts['frames'] / fps / 60:.1f} minutes · "
+        f"{lengths['min']} to {lengths['max']} frames an episode (median {lengths['median']:g}){robot}{revision}",
+        soft_wrap=True,
+    )
+    if facts.get("excluded"):
+        console.print(
+            f"left out by the configuration: episodes {', '.join(map(str, facts['excluded']))}", soft_wrap=True
+        )
+    tasks = [(words, count) for words, count in facts["tasks"].items() if words]
+    for words, count in tasks[:SHOWN]:
+        console.print(f"task “{escape(words)}”: {count} episode{'s' * (count != 1)}", soft_wrap=True)
+    if len(tasks) > SHOWN:
+        console.print(f"… and {len(tasks) - SHOWN} more tasks", soft_wrap=True)
+    console.print(f"[dim]content hash {facts['content_hash']}[/]\n", soft_wrap=True)
+
+
+def _columns(facts: Mapping[str, Any]) -> Table:
+    """A row a column; what only action columns have is empty for the others."""
+    table = Table("column", "unit", "kind", "tracking lag", "mean |a − s|", "range", title_justify="left")
+    for feature in sorted(facts["features"], key=lambda feature: feature["key"] != "action"):
+        table.add_row(f"[bold]{escape(feature['key'])}[/]")
+        if len(feature["names"]) > WIDE:
+            table.add_row(f"  {len(feature['names'])} columns", "", "", "", "", _wide_range(feature))
+            continue
+        for position in range(len(feature["names"])):
+            table.add_row(*_row(facts, feature, position))
+    return table
+
+
+def _row(facts: Mapping[str, Any], feature: Mapping[str, Any], position: int) -> tuple[str, ...]:
+    kind, lag, gap = "", "", ""
+    if feature["key"] == "action":
+        kind = facts["action_kinds"][position]
+        frames = facts["lag_frames"][position]
+        # A velocity worked out between neighbouring states is half a frame early: no lag, for a reader.
+        lag = "—" if frames is None else f"{frames:.1f} frames ({1e3 * frames / facts['fps']:.0f} ms)"
+        gap = "—" if facts["tracking_lag"][position] is None else f"{facts['tracking_lag'][position]:.4g}"
+    if feature["dead"][position]:
+        kind += " [yellow]dead[/]"
+    if feature["circular"][position]:
+        kind += " angle"
+    unit = feature["units"][position] or "?"
+    values = f"{_number(feature['min'][position])} … {_number(feature['max'][position])}"
+    return f"  {escape(feature['names'][position])}", escape(unit), kind.strip(), lag, gap, values
+
+
+def _number(value: float | None) -> str:
+    return "—" if value is None else f"{value:.4g}"
+
+
+def _wide_range(feature: Mapping[str, Any]) -> str:
+    known = [value for value in (*feature["min"], *feature["max"]) if value is not None]
+    return f"{_number(min(known, default=None))} … {_number(max(known, default=None))}"
+
+
+def _show_findings(findings: Sequence[Mapping[str, Any]], console: Console) -> None:
+    quiet = [check for check in CHECKS if check not in {finding["check"] for finding in findings}]
+    if not findings:
+        console.print(f"[green]Nothing looks wrong.[/] Looked for: {', '.join(CHECKS)}.", soft_wrap=True)
+        return
+    console.print(f"[bold]What looks wrong[/]  (nothing by: {', '.join(quiet) or '—'})", soft_wrap=True)
+    for check, group in groupby(findings, key=lambda finding: finding["check"]):
+        mine = list(group)
+        console.print(f"[yellow]{check}[/]")
+        for finding in mine[:SHOWN]:
+            where = "" if finding["episode"] is None else f"episode {finding['episode']}: "
+            console.print(f"  {where}{escape(finding['words'])}", soft_wrap=True)
+        if len(mine) > SHOWN:
+            console.print(f"  … and {len(mine) - SHOWN} more; --json lists them all", soft_wrap=True)
+    console.print()
+
+
+def _show_episodes(facts: Mapping[str, Any], console: Console) -> None:
+    if facts["look_at"]:
+        console.print("[bold]Look at these episodes first[/]")
+        for place, one in enumerate(facts["look_at"], 1):
+            console.print(f"  {place}. {escape(one['command'])}", soft_wrap=True)
+            for reason in one["reasons"]:
+                console.print(f"     {escape(reason)}", soft_wrap=True)
+    elif facts["findings"]:
+        console.print("No single episode stands out.")
+    if facts["exclude_line"]:
+        console.print(
+            "\n[bold]Worth leaving out[/], once you have looked: put this under the data set in demobench.toml",
+            soft_wrap=True,
+        )
+        console.print(f"  {escape(facts['exclude_line'])}", soft_wrap=True)

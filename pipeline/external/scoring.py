@@ -1,0 +1,134 @@
+"""A file of predictions, scored like a policy of ours: same anchors, same errors, same intervals.
+
+What belongs here: from the file to `Predictions`, errors and metrics. What does not: reading it (`reading`), finding faults
+(`checks`), comparing it (`pairing`).
+"""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import DatasetError
+from pipeline.experiment import Experiment, Variant
+from pipeline.external.anchors import require_strict
+from pipeline.external.checks import check_alignment, mean_of
+from pipeline.external.reading import Answers, read_answers
+from pipeline.external.training import HeldOut, Training, held_out_of
+from pipeline.folds import PolicyTask
+from pipeline.methods import EXTERNAL
+from pipeline.normalize import circular_columns
+from pipeline.statistics.distributions import score_samples
+from pipeline.statistics.intervals import estimate_mean
+from pipeline.statistics.metrics import Score, score_task
+from pipeline.types import ACTION, Demonstrations, Fold, Predictions, Semantics, Split
+
+ELSEWHERE = "elsewhere"
+"""The observation set of a row that does not say what its policy sees."""
+
+
+@dataclass(frozen=True)
+class Scored:
+    """Predictions from elsewhere with their score.
+
+    held_out   which episodes are scored, and what is known of the training
+    samples    scores of the samples at the first step (JSON-able), None where there is one
+    warnings   what looks wrong without keeping them from being scored
+    """
+
+    predictions: Predictions
+    score: Score
+    held_out: HeldOut
+    samples: dict[str, Any] | None
+    warnings: tuple[str, ...]
+
+    def summary(self, demos: Demonstrations) -> dict[str, Any]:
+        """What a table needs to know of it besides its errors (JSON-able)."""
+        return {
+            "metrics": self.score.metrics,
+            "chunk": int(self.predictions.actions.shape[2]),
+            "seeds": len(self.predictions.seeds),
+            "windows_train": None,
+            "windows_test": len(self.predictions.anchors),
+            "latency_ms": None,
+            "seen_in_training": self.held_out.seen,
+            "training": self.held_out.words,
+            "episodes": demos.episode_ids[self.held_out.episodes].tolist(),
+            "samples": self.samples,
+            "warnings": list(self.warnings),
+        }
+
+
+def score_file(
+    path: Path,
+    *,
+    name: str,
+    observations: str | None,
+    training: Training | None,
+    demos: Demonstrations,
+    semantics: Semantics,
+    split: Split,
+    experiment: Experiment,
+) -> Scored:
+    """Read, check and score a file of predictions.
+
+    Raises
+    ------
+    DatasetError : the file cannot be read, or is not aligned with what was recorded.
+    ConfigError : its folds are not those of the training.
+    NotApplicableError : the protocol is not `strict`.
+    """
+    require_strict(experiment.protocol)
+    answers = read_answers(path, demos, experiment.history)
+    circular = circular_columns(demos, semantics, [ACTION])
+    actions = answers.actions[:, 0] if answers.actions.shape[1] == 1 else mean_of(answers.actions, circular, (1,))
+    faults = check_alignment(answers.anchors, mean_of(actions, circular, (0,)), demos, semantics)
+    if faults.refuse:
+        raise DatasetError(f"{path}: {'; '.join(faults.refuse)}.")
+    held_out = held_out_of(answers.covered, answers.fold, training, demos)
+    keep = np.isin(demos.episode_of_frame[answers.anchors], held_out.episodes)
+    anchors = answers.anchors[keep]
+    at = np.searchsorted(held_out.episodes, demos.episode_of_frame[anchors])
+    label = observations or ELSEWHERE
+    predictions = Predictions(name, label, answers.seeds, anchors, held_out.fold[at], actions[:, keep])
+    task = _task(name, predictions, held_out, demos, semantics, split, experiment)
+    samples = _score_samples(answers, keep, held_out, demos, circular) if answers.actions.shape[1] > 1 else None
+    warnings = (*answers.notes, *faults.warn)
+    return Scored(predictions, score_task(task, predictions), held_out, samples, warnings)
+
+
+def _task(
+    name: str, predictions: Predictions, held_out: HeldOut, demos: Demonstrations, semantics: Semantics, split: Split,
+    experiment: Experiment,
+) -> PolicyTask:  # fmt: skip
+    """The predictions as a policy of ours would have made them: a fold for each training, the scored episodes held out."""
+    folds = [
+        Fold(train, tuple(held_out.episodes[held_out.fold == number].tolist()))
+        for number, train in enumerate(held_out.train)
+    ]
+    variant = Variant(name, name, EXTERNAL, int(predictions.actions.shape[2]))
+    seen = experiment.observation_sets[0]
+    return PolicyTask(demos, semantics, Split(tuple(folds), split.seed, split.hash), seen, variant, experiment)
+
+
+def _score_samples(
+    answers: Answers, keep: np.ndarray, held_out: HeldOut, demos: Demonstrations, circular: np.ndarray
+) -> dict[str, Any]:
+    """The fair energy score of the first actions' samples, beside what their mean and one of them are worth.
+
+    Distances are Euclidean over action columns; where their units differ, in deviations of the recorded column.
+    """
+    anchors = answers.anchors[keep]
+    recorded = demos.columns[ACTION][anchors]
+    mixed = len(set(demos.features[ACTION].units)) > 1
+    scale = np.where(recorded.std(axis=0) > 0, recorded.std(axis=0), np.nan) if mixed else None
+    scores = asdict(score_samples(answers.actions[:, :, keep, 0], recorded, circular=circular, scale=scale))
+    row = np.searchsorted(held_out.episodes, demos.episode_of_frame[anchors])
+    counts = np.bincount(row, minlength=len(held_out.episodes))
+    found: dict[str, Any] = {"count": int(answers.actions.shape[1]), "in_deviations": mixed}
+    for name, values in scores.items():
+        of_episode = np.stack([np.bincount(row, one, minlength=len(counts)) / counts for one in values])
+        mean = estimate_mean(of_episode, fold=held_out.fold)
+        found[name] = {"value": mean.value, "interval": None if mean.interval is None else list(mean.interval)}
+    return found

@@ -1,0 +1,114 @@
+"""The same recording twice: whole, shifted by some frames, or a part of another.
+
+A few frames of each episode, where it moves most, are looked up among all frames: [action, state], divided by their
+spans, through four fixed random projections, which keep equal frames equal and near ones near, so that a tree over them
+is small and quick. Two episodes that meet there at one and the same shift are then compared frame by frame.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from pipeline.inspection.finding import Finding
+from pipeline.inspection.survey import Survey
+from pipeline.types import ACTION, STATE
+
+PROJECTIONS, ASKED, NEAR, MOST = 4, 8, 2e-3, 64
+"""Numbers a frame is looked up by, frames asked of each episode, how near counts (in spans), and neighbours looked at."""
+
+SAME, OVERLAP = 0.005, 0.6
+"""Two stretches are the same recording when their columns differ by 0.5 % of their span on average (people who repeat a
+task are never that exact), over at least 60 % of the shorter episode."""
+
+
+def check_duplicates(survey: Survey) -> Iterator[Finding]:
+    candidates = _candidates(survey)
+    told: set[int] = set()
+    for (one, other, shift), _ in candidates.most_common():
+        if one in told or other in told:
+            continue
+        frames, difference = _compare(survey, one, other, shift)
+        shorter = min(survey.demos.lengths[one], survey.demos.lengths[other])
+        if frames < OVERLAP * shorter or difference > SAME:
+            continue
+        lesser, kept = (one, other) if survey.demos.lengths[one] < survey.demos.lengths[other] else (other, one)
+        told.add(lesser)
+        by = f", shifted by {abs(shift)} frames" if shift else ""
+        exactly = "exactly" if difference == 0 else f"to {difference:.2%} of their range"
+        yield Finding(
+            "duplicate", survey.id(lesser), None, frames / shorter, OVERLAP,
+            f"It is the same recording as episode {survey.id(kept)}{by}: {frames} of its {survey.demos.lengths[lesser]} frames "
+            f"agree {exactly}.", grave=True,
+        )  # fmt: skip
+
+
+def _candidates(survey: Survey) -> Counter:
+    """(episode, other episode, shift) → how many of the frames asked met there; at least a quarter of them."""
+    from scipy.spatial import cKDTree
+
+    points = _points(survey)
+    if points is None or survey.demos.episodes < 2:
+        return Counter()
+    asked = _asked(survey, points)
+    tree = cKDTree(points, balanced_tree=False)
+    distances, found = tree.query(points[asked], k=min(MOST, len(points)), distance_upper_bound=NEAR)
+    starts = survey.starts
+    met: Counter = Counter()
+    mine = np.searchsorted(starts, asked, side="right") - 1
+    for row, frame in enumerate(asked):
+        near = found[row][np.isfinite(distances[row])]
+        theirs = np.searchsorted(starts, near, side="right") - 1
+        shifts = (near - starts[theirs]) - (frame - starts[mine[row]])
+        met.update(
+            {_pair(mine[row], other, shift) for other, shift in zip(theirs, shifts, strict=True) if other != mine[row]}
+        )
+    return Counter({pair: count for pair, count in met.items() if count >= ASKED // 4})
+
+
+def _pair(one: int, other: int, shift: int) -> tuple[int, int, int]:
+    """The same pair from either side; frame t of the first is frame t + shift of the second."""
+    return (int(one), int(other), int(shift)) if one < other else (int(other), int(one), -int(shift))
+
+
+def _points(survey: Survey) -> np.ndarray | None:
+    """[N, PROJECTIONS] float32."""
+    living = [(f, int(i)) for f in (ACTION, STATE) for i in np.flatnonzero(~survey.dead[f]) if survey.spans[f][i] > 0]
+    if not living:
+        return None
+    weights = np.random.default_rng(0).normal(size=(len(living), PROJECTIONS)) / np.sqrt(len(living))
+    points = np.zeros((survey.demos.frames, PROJECTIONS), np.float32)
+    for (feature, i), weight in zip(living, weights, strict=True):
+        scaled = survey.demos.columns[feature][:, i] / np.float32(survey.spans[feature][i])
+        for number in range(PROJECTIONS):
+            points[:, number] += np.float32(weight[number]) * scaled
+    return points
+
+
+def _asked(survey: Survey, points: np.ndarray) -> np.ndarray:
+    """Global frames to look up: in each of ASKED parts of an episode the one where it moves most; none where it rests."""
+    asked = []
+    for episode in range(survey.demos.episodes):
+        frames = survey.demos.episode(episode)
+        speed = np.abs(np.diff(points[frames], axis=0)).max(axis=1) if frames.stop - frames.start > 1 else np.zeros(0)
+        for part in np.array_split(np.arange(len(speed)), ASKED):
+            if len(part) and speed[part].max() > NEAR:
+                asked.append(frames.start + int(part[np.argmax(speed[part])]))
+    return np.array(asked, np.int64)
+
+
+def _compare(survey: Survey, one: int, other: int, shift: int) -> tuple[int, float]:
+    """How many frames overlap, and their mean difference in spans."""
+    starts, lengths = survey.starts, survey.demos.lengths
+    low, high = max(0, -shift), min(int(lengths[one]), int(lengths[other]) - shift)
+    if high <= low:
+        return 0, np.inf
+    total, columns = 0.0, 0
+    for feature in (ACTION, STATE):
+        keep = ~survey.dead[feature] & (survey.spans[feature] > 0)
+        values = survey.demos.columns[feature]
+        a = values[starts[one] + low : starts[one] + high][:, keep]
+        b = values[starts[other] + low + shift : starts[other] + high + shift][:, keep]
+        total += float((np.abs(a - b) / survey.spans[feature][keep]).mean(axis=0).sum())
+        columns += int(keep.sum())
+    return high - low, total / max(1, columns)
