@@ -10,7 +10,6 @@ from typing import Annotated, Literal
 import typer
 from rich.console import Console
 
-from demobench import commands
 from pipeline.config import BudgetName
 from pipeline.errors import DemobenchError
 from pipeline.types import Protocol
@@ -75,7 +74,9 @@ def run(
     json_to: JsonOption = None,
 ) -> None:
     """Run the whole benchmark: from demonstrations to a table, a page, recordings and tracked metrics."""
-    commands.run_benchmarks(
+    from demobench.commands.run import run_benchmarks
+
+    run_benchmarks(
         datasets or [],
         choices={
             "policies": policies, "chunks": chunks, "observations": observations, "seeds": seeds, "steps": steps,
@@ -94,7 +95,9 @@ def inspect(
     json_to: JsonOption = None,
 ) -> None:
     """What is in a data set: counts, features, kinds of action, units, tracking lag, and what looks wrong. No training."""
-    commands.inspect_dataset(dataset, config, json_to)
+    from demobench.commands.inspect import inspect_dataset
+
+    inspect_dataset(dataset, config, json_to)
 
 
 @app.command(
@@ -121,7 +124,9 @@ def floor(
     json_to: JsonOption = None,
 ) -> None:
     """How small can the error of a deterministic policy get here? People do different things in the same place."""
-    commands.measure_floor(
+    from demobench.commands.floor import measure_floor
+
+    measure_floor(
         dataset,
         radius=radius,
         probes=probes,
@@ -147,7 +152,7 @@ def success(
     json_to: JsonOption = None,
 ) -> None:
     """Success rates of real-robot trials: how sure each is, which policy is better, and how many trials would tell."""
-    from demobench.success import judge_success
+    from demobench.commands.success import judge_success
 
     judge_success(counts, json_to)
 
@@ -167,7 +172,7 @@ def compare(
     json_to: JsonOption = None,
 ) -> None:
     """Which policy is better? Paired over held-out episodes: better, worse, cannot tell, or not comparable, and why."""
-    from demobench.compare import compare_policies
+    from demobench.commands.compare import compare_policies
 
     compare_policies(addresses, config, store, json_to)
 
@@ -204,7 +209,7 @@ def curve(
     json_to: JsonOption = None,
 ) -> None:
     """Would more demonstrations help? Yes, no, or cannot tell: error against the number of training episodes."""
-    from demobench.curve import run_curve
+    from demobench.commands.curve import run_curve
 
     run_curve(
         dataset,
@@ -246,7 +251,7 @@ def split(
     json_to: JsonOption = None,
 ) -> None:
     """Which episodes train and which are held out, so that you can train elsewhere without the held-out ones."""
-    from demobench.split import run_split
+    from demobench.commands.split import run_split
 
     run_split(
         dataset, form=form, out=out, folds=folds, fold=fold, config_path=config, store_path=store, json_to=json_to
@@ -294,7 +299,7 @@ def score(
     json_to: JsonOption = None,
 ) -> None:
     """Predictions made anywhere become a row of the same table: same anchors, same intervals, same verdicts."""
-    from demobench.score import run_score
+    from demobench.commands.score import run_score
 
     run_score(
         dataset,
@@ -324,7 +329,9 @@ def view(
     store: StoreOption = None,
 ) -> None:
     """Look at one episode in Rerun: what was recorded, and what every policy would have done."""
-    commands.view_episode(dataset, episode, policy, save, config, store)
+    from demobench.commands.view import view_episode
+
+    view_episode(dataset, episode, policy, save, config, store)
 
 
 @app.command(epilog="Examples:\n\n    demobench selftest\n\n    demobench selftest --full --page docs/known_truth.md")
@@ -344,7 +351,7 @@ def selftest(
 
     The exit status is 1 where a goal is missed.
     """
-    from demobench.selftest import run_selftest
+    from demobench.commands.selftest import run_selftest
 
     passed = run_selftest(full=full, workers=workers, page=page, config_path=config, store_path=store, json_to=json_to)
     if not passed:
@@ -359,7 +366,7 @@ def ui(
     store: StoreOption = None,
 ) -> None:
     """Dagster and MLflow in the browser, on 127.0.0.1. Ctrl-C stops both."""
-    from demobench.servers import serve
+    from demobench.commands.ui import serve
 
     serve(port, mlflow_port, config, store)
 
@@ -372,7 +379,9 @@ def record_pusht(
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
     """Record PushT demonstrations in simulation, by a planner with two strategies, as a LeRobot data set."""
-    commands.record_pusht(out, episodes, seed, workers)
+    from demobench.commands.record import record_pusht
+
+    record_pusht(out, episodes, seed, workers)
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ from safetensors.numpy import save_file
 
 from assets_defs.plan import Plan, Unit
 from demobench.cli import main
-from demobench.compare import compare_policies, compare_rollouts, parse_address
+from demobench.commands.compare import compare_policies, compare_rollouts, parse_address
 from pipeline.config import load_config
 from pipeline.errors import ConfigError, StoreError
 from pipeline.experiment import from_config

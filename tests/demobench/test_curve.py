@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from demobench.curve import parse_sizes
+from demobench.commands.curve import parse_sizes
 from pipeline.errors import ConfigError
 from tests.demobench.test_cli import ENVIRONMENT, demobench
 from tests.makers import tiny_recording, write_v3

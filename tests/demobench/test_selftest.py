@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from demobench.cli import app
-from demobench.selftest import run_selftest
+from demobench.commands.selftest import run_selftest
 from pipeline.statistics.known_truth.shards import Shard, code_hash
 
 TINY = [

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from demobench.split import split_json
+from demobench.commands.split import split_json
 from pipeline.errors import ConfigError
 from pipeline.external.training import EVERY_FOLD, Training, held_out_of, lerobot_training_file, read_training
 

@@ -14,16 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 
-from demobench.commands import (
-    Session,
-    check_source,
-    collect,
-    materialise,
-    open_dataset,
-    open_session,
-    show,
-    write_json_to,
-)
+from demobench.commands.run import check_source, collect, materialise, show
+from demobench.commands.session import Session, open_dataset, open_session, write_json_to
 from pipeline.errors import ConfigError, NotApplicableError, StoreError
 from pipeline.experiment import Target
 from pipeline.store import write_json
@@ -110,7 +102,7 @@ def _plan(opened: Opened, asked: Mapping[str, Any] | None = None) -> "Plan":
 
 
 def _write_anchors(opened: Opened, path: Path, fold: int | None) -> None:
-    from demobench.split import split_json
+    from demobench.commands.split import split_json
     from pipeline.external.anchors import require_strict, write_anchors
     from pipeline.folds import split_of
 

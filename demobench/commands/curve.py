@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from demobench.commands import Session, check_source, materialise, open_session, short, write_json_to
+from demobench.commands.run import check_source, materialise
+from demobench.commands.session import Session, open_session, short, write_json_to
 from pipeline.experiment import Choices, Target, parse_list, parse_sizes, resolve_target
 
 

@@ -1,16 +1,18 @@
-"""What `demobench inspect` prints: facts, columns, what looks wrong, the episodes to look at, and those to leave out.
+"""`demobench inspect`: facts, columns, what looks wrong, the episodes to look at, and those to leave out.
 
 What does not belong here: finding anything (pipeline/inspection).
 """
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from demobench.commands.session import open_dataset, open_session, write_json_to
 from pipeline.inspection.finding import CHECKS
 
 WIDE = 24
@@ -18,6 +20,25 @@ WIDE = 24
 
 SHOWN = 5
 """Findings of one check that are printed; --json has all."""
+
+
+def inspect_dataset(argument: str, config_path: Path | None, json_to: str | None) -> None:
+    """The facts of a data set, and what looks wrong with it."""
+    from demobench.progress import status_line
+    from pipeline.inspection.look import inspect
+    from pipeline.inspection.videos import local_folder
+    from pipeline.lerobot_format import quality
+
+    session = open_session(config_path, None, json_to)
+    target, demos, semantics = open_dataset(argument, session)
+    folder = local_folder(target.experiment.dataset.source, session.config_dir)
+    with status_line(long=demos.frames > 200_000) as say:
+        found = inspect(demos, semantics, folder, say)
+    facts = quality.inspect_dataset(demos, semantics) | found.as_json(argument)
+    if json_to != "-":
+        repeated = [*quality.dead_warnings(demos), *quality.clock_warnings(demos)]
+        show_inspection(facts, session.console, repeated)
+    write_json_to(json_to, facts)
 
 
 def show_inspection(facts: Mapping[str, Any], console: Console, said_by_checks: Sequence[str] = ()) -> None:

@@ -10,7 +10,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from demobench.commands import Session, open_session, write_json_to
+from demobench.commands.session import Session, open_session, write_json_to
 from pipeline.errors import ConfigError, StoreError, did_you_mean
 from pipeline.experiment import Choices, Variant, no_such_dataset, resolve_target
 from pipeline.methods import EXTERNAL

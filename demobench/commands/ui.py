@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from demobench.commands import Session, open_session
+from demobench.commands.session import Session, open_session
 from pipeline.errors import DemobenchError
 from pipeline.sinks.to_mlflow import tracking_uri
 

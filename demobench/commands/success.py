@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from demobench.commands import write_json_to
+from demobench.commands.session import write_json_to
 from pipeline.errors import ConfigError
 from pipeline.statistics import success
 from pipeline.statistics.trials import read_trials

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from demobench.commands import open_session, write_json_to
+from demobench.commands.session import open_session, write_json_to
 from demobench.progress import counting_bar
 
 if TYPE_CHECKING:

@@ -1,13 +1,55 @@
-"""Terminal output of `floor`. What does not belong here: computing anything."""
+"""`demobench floor`: how small an error can get, measured and shown. What does not belong here: any estimator."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from demobench.commands.session import open_dataset, open_session, write_json_to
+from pipeline.experiment import parse_horizons, parse_list
 from pipeline.types import FloorEstimate, RadiusFloor
+
+
+def measure_floor(
+    argument: str,
+    *,
+    radius: float | None,
+    probes: int,
+    min_neighbours: int,
+    observations: str | None,
+    horizons: str | None,
+    config_path: Path | None,
+    json_to: str | None,
+) -> None:
+    """The floors of the states that a benchmark would score, and the notebook's."""
+    from pipeline.folds import split_of
+    from pipeline.lerobot_format import quality
+    from pipeline.statistics.floors import measure_floors
+    from pipeline.statistics.radius import radius_floor
+    from pipeline.table import dataset_json, floor_json
+
+    session = open_session(config_path, None, json_to)
+    asked = parse_horizons(horizons)
+    target, demos, semantics = open_dataset(argument, session)
+    experiment = target.experiment
+    sets = {s.name: s for s in experiment.observation_sets}
+    wanted = parse_list(observations) or tuple(sets)
+    experiment.require_sets(wanted)
+    floors = [
+        radius_floor(demos, semantics, sets[name], radius=radius, probes=probes, min_neighbours=min_neighbours)
+        for name in wanted
+    ]
+    split = split_of(experiment, demos)
+    settings = {"history": experiment.history, "horizons": asked or experiment.floor_horizons(demos.fps)}
+    estimates = [e for name in wanted for e in measure_floors(demos, semantics, sets[name], split, **settings)]
+    facts = quality.inspect_dataset(demos, semantics)
+    if json_to != "-":
+        show_estimates(estimates, facts, session.console)
+        show_radius(floors, session.console)
+    write_json_to(json_to, {"dataset": dataset_json(facts), "floor": floor_json(floors, estimates)})
 
 
 def _number(value: float | None, digits: int = 4) -> str:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from demobench.commands import open_session, write_json_to
+from demobench.commands.session import open_session, write_json_to
 from pipeline.errors import ConfigError, StoreError
 from pipeline.types import Demonstrations, Split
 
@@ -34,7 +34,7 @@ def run_split(
     ------
     ConfigError : no such fold.
     """
-    from demobench.commands import open_dataset
+    from demobench.commands.session import open_dataset
     from pipeline.experiment import Choices
     from pipeline.folds import split_of
 

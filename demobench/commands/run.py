@@ -1,0 +1,189 @@
+"""`demobench run`: settings → plan → Dagster run → table."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from demobench.commands.session import Session, open_session, program, short, write_json_to
+from pipeline.errors import ConfigError, StoreError
+from pipeline.experiment import Choices, Target, parse_chunks, parse_list, resolve_target, select_rows
+from pipeline.methods import METHODS, is_own
+
+
+def run_benchmarks(
+    datasets: Sequence[str],
+    *,
+    choices: Mapping[str, Any],
+    config_path: Path | None,
+    store_path: str | None,
+    json_to: str | None,
+) -> None:
+    """Benchmark every data set asked for; what is up to date is kept."""
+    session = open_session(config_path, store_path, json_to)
+    chosen = Choices(
+        **{
+            **choices,
+            "policies": parse_list(choices["policies"]),
+            "chunks": parse_chunks(choices["chunks"]),
+            "observations": parse_list(choices["observations"]),
+        }
+    )
+    names = list(dict.fromkeys(datasets)) or list(session.config.datasets)
+    if not names:
+        raise ConfigError("The configuration has no data sets. Name one: demobench run some/lerobot/folder")
+    registered = session.store.experiments()
+    targets = [resolve_target(n, session.config, session.config_dir, chosen, registered) for n in names]
+    check_source(targets, session)
+    session.store.ensure()
+    results = [_run_one(target, session) for target in targets]
+    write_json_to(json_to, results)
+
+
+def check_source(targets: Sequence[Target], session: Session) -> None:
+    """Fail before any work when a folder is not there, or is no data set, or a policy's class cannot be had."""
+    from pipeline.lerobot_format.read import check_experiment
+
+    for target in targets:
+        check_experiment(target.experiment, session.config_dir)
+        for method in {v.method for v in target.selected if is_own(v.method)}:
+            METHODS[method].load_class().check()
+
+
+def _run_one(target: Target, session: Session) -> dict[str, Any]:
+    from assets_defs.plan import Plan
+
+    console, store = session.console, session.store
+    plan = Plan(
+        store,
+        target.key,
+        target.experiment,
+        tuple(target.experiment.variants),
+        tuple(v.name for v in target.selected),
+        target.observations,
+    )
+    with store.lock(target.key):
+        store.register(target.key, target.experiment.model_dump(mode="json"))
+        stale = plan.stale()
+        if stale:
+            materialise(target, session, list(stale))
+        else:
+            console.print(f"[bold]{target.key}[/] is up to date: nothing to compute.")
+    plan.forget()
+    report = collect(target, plan, session)
+    show(report, target, session)
+    for unit in plan.scored_units():
+        if not plan.is_fresh(unit):
+            console.print(
+                f"  [yellow]'{unit.entry}', predicted elsewhere, is not in the table: its data, settings or code changed. Score it "
+                "again with: demobench score[/]",
+                soft_wrap=True,
+            )
+    return report
+
+
+def materialise(
+    target: Target,
+    session: Session,
+    stale: Sequence[Any],
+    *,
+    job: str | None = None,
+    ops: Mapping[str, Any] | None = None,
+) -> None:
+    """Make stale results as a Dagster run of a job (the benchmark by default) with bars; `ops` are settings of single assets.
+
+    Raises:
+        StoreError: the run's log cannot be written.
+        DemobenchError: what the run failed for.
+        typer.Exit: Ctrl-C.
+    """
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from demobench.progress import RunProgress
+
+    with RunProgress(session.console, target, stale) as progress:
+        from assets_defs.automation import BENCHMARK
+        from assets_defs.definitions import build_defs
+        from assets_defs.launch import Interrupts, close_dead_runs, open_instance, run_benchmark
+        from assets_defs.resources import asset_keys
+
+        with Interrupts() as interrupts, open_instance(session.store.root) as instance:
+
+            def report(*what: Any) -> None:
+                interrupts.check()
+                progress.report(*what)
+
+            defs = build_defs(
+                session.config,
+                config_dir=session.config_dir,
+                store=session.store,
+                progress=report,
+                experiments={target.key: target.experiment},
+            )
+            for run_id in close_dead_runs(instance):
+                progress.say(f"closed run {run_id[:8]}, whose process was gone")
+            try:
+                run = run_benchmark(
+                    instance,
+                    defs,
+                    target.key,
+                    asset_keys(stale),
+                    target.observations,
+                    [v.name for v in target.selected],
+                    progress.on_event,
+                    job_name=job or BENCHMARK,
+                    ops=ops,
+                )
+            except KeyboardInterrupt:
+                progress.stop()
+                session.console.print("Stopped. What was finished is kept; the same command goes on from there.")
+                raise typer.Exit(130) from None
+            except (OSError, SQLAlchemyError) as error:
+                raise StoreError(
+                    f"The run stopped because its log could not be written: {str(error).splitlines()[0]}. Results that were "
+                    f"finished are intact in {session.store.root}. Free some space there and run the same command again."
+                ) from error
+    if not run.is_success:
+        progress.raise_failure(run.run_id)
+
+
+def collect(target: Target, plan: Any, session: Session) -> dict[str, Any]:
+    """The table's JSON, less what was not asked for, with the paths of what was made."""
+    from assets_defs.plan import Unit
+
+    built = json.loads((plan.folder(Unit("benchmark_table")) / "table.json").read_text(encoding="utf-8"))
+    built["policies"] = select_rows(built["policies"], target)
+    mlflow = session.config.tracking.mlflow
+    built["artifacts"] = {
+        "report": str(plan.folder(Unit("benchmark_report")) / "report.html"),
+        "mcap": str(plan.folder(Unit("mcap_log")) / "held_out.mcap"),
+        "rerun": str(plan.folder(Unit("rerun_recording")) / "held_out.rrd"),
+        "mlflow": f"sqlite:///{session.store.root / 'mlflow.db'}" if mlflow == "sqlite" else mlflow,
+    }
+    return built
+
+
+def show(report: Mapping[str, Any], target: Target, session: Session, marked: str | None = None) -> None:
+    """The table and where its files are; `marked` is the address of the row that this is about."""
+    from pipeline.table import render_table
+
+    console = session.console
+    render_table(report, console, marked)
+    paths = report["artifacts"]
+    opens = {
+        "report": f"xdg-open {short(paths['report'])}",
+        "mcap": f"{program('rerun')} --bind 127.0.0.1 {short(paths['mcap'])}",
+        "rerun": f"{program('rerun')} --bind 127.0.0.1 {short(paths['rerun'])}",
+        "mlflow": f"{program('demobench')} ui",
+    }
+    names = {"report": "Report", "mcap": "MCAP", "rerun": "Rerun", "mlflow": "MLflow"}
+    for kind, name in names.items():
+        console.print(f"  {name:<7}{short(paths[kind])}", soft_wrap=True)
+        console.print(f"         [dim]open with:[/] {opens[kind]}", soft_wrap=True)
+    if not target.file_has_it:
+        console.print(
+            "  [yellow]This run has policies or chunk sizes that the configuration does not define: the Dagster UI shows it "
+            "but cannot run it again.[/]"
+        )

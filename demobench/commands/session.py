@@ -1,0 +1,77 @@
+"""What every command begins and ends with: the configuration, the store, the data set, and JSON.
+
+What does not belong here: what one command does.
+"""
+
+import json
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from pipeline.config import Config, find_config, load_config
+from pipeline.errors import StoreError
+from pipeline.experiment import Choices, Target, resolve_target
+from pipeline.store import Store, write_json
+
+
+@dataclass(frozen=True)
+class Session:
+    """A configuration, where it lies, its store, and where to print."""
+
+    config: Config
+    config_dir: Path
+    store: Store
+    console: Console
+
+
+def open_session(config_path: Path | None, store_path: str | None, json_to: str | None = None) -> Session:
+    """Read the configuration; with `--json -` everything that is not JSON goes to standard error."""
+    path = find_config(config_path)
+    config = load_config(path)
+    config_dir = path.parent if path else Path.cwd()
+    if store_path is not None:
+        config = config.model_copy(update={"store": type(config.store)(path=store_path)})
+        store = Store(Path.cwd() / Path(store_path).expanduser())
+    else:
+        store = Store(config_dir / Path(config.store.path).expanduser())
+    return Session(config, config_dir, store, Console(stderr=json_to == "-", highlight=False, soft_wrap=False))
+
+
+def write_json_to(target: str | None, value: Any) -> None:
+    """`-` is standard output; anything else a file, written whole or not at all."""
+    if target == "-":
+        sys.stdout.write(json.dumps(value, indent=1, allow_nan=False) + "\n")
+    elif target:
+        try:
+            write_json(Path(target), value)
+        except OSError as error:
+            raise StoreError(f"The JSON cannot be written to {target}: {error.strerror}.") from None
+
+
+def open_dataset(argument: str, session: Session, choices: Choices | None = None) -> tuple[Target, Any, Any]:
+    """The data set of a name, folder or Hub address, and what its columns mean."""
+    from pipeline.lerobot_format.read import load_experiment
+
+    registered = session.store.experiments()
+    target = resolve_target(argument, session.config, session.config_dir, choices or Choices(), registered)
+    return target, *load_experiment(target.experiment, session.config_dir)
+
+
+def program(name: str) -> str:
+    """How to call a program that was installed beside this one: by name where that finds it, else by its path."""
+    here = Path(sys.executable).parent / name
+    found = shutil.which(name)
+    return name if found and Path(found).resolve() == here.resolve() else short(str(here))
+
+
+def short(path: str) -> str:
+    """Relative to the working directory where that is shorter."""
+    prefix, plain = ("sqlite:///", path.removeprefix("sqlite:///")) if path.startswith("sqlite:///") else ("", path)
+    try:
+        return prefix + str(Path(plain).relative_to(Path.cwd()))
+    except ValueError:
+        return path

@@ -1,0 +1,73 @@
+"""`demobench view`: one episode in Rerun, as it was recorded and as every policy would have done."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from demobench.commands.session import Session, open_dataset, open_session
+from pipeline.errors import ConfigError, did_you_mean
+from pipeline.experiment import Target, parse_list
+
+
+def view_episode(
+    argument: str,
+    episode: int,
+    policy: str | None,
+    save: Path | None,
+    config_path: Path | None,
+    store_path: str | None,
+) -> None:
+    """One episode with what every up-to-date policy predicted in it (held-out episodes have predictions)."""
+    import numpy as np
+
+    from assets_defs.plan import Plan, Unit
+    from pipeline.predict import load_predictions
+    from pipeline.sinks import to_rerun
+
+    session = open_session(config_path, store_path)
+    target, demos, semantics = open_dataset(argument, session)
+    position = np.flatnonzero(demos.episode_ids == episode)
+    if not len(position):
+        raise ConfigError(
+            f"'{target.key}' has no episode {episode}. Its episodes are {demos.episode_ids.min()} to {demos.episode_ids.max()}."
+        )
+    plan = Plan(session.store, target.key, target.experiment, tuple(target.experiment.variants))
+    units = plan.fresh_predictions() if plan.is_fresh(Unit("demonstrations")) else []
+    wanted = parse_list(policy)
+    names = {u.policy for u in units}
+    for name in wanted:
+        if name not in names:
+            raise ConfigError(
+                f"No up-to-date predictions of a policy '{name}' for '{target.key}'. {did_you_mean(name, names)}"
+            )
+    predictions = [load_predictions(plan.folder(u)) for u in units if not wanted or u.policy in wanted]
+    frames = demos.episode(int(position[0]))
+    if not any(len(p.in_frames(frames)) for p in predictions):
+        session.console.print(_why_no_predictions(episode, predictions, demos, target, session), soft_wrap=True)
+    path = save or session.store.dataset(target.key) / "view.rrd"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    to_rerun.write_rerun(path, demos, semantics, predictions, [int(position[0])], name=f"{target.key} {episode}")
+    if save:
+        session.console.print(f"Written to {save}. Open it with: rerun --bind 127.0.0.1 {save}", soft_wrap=True)
+    else:
+        to_rerun.view(path)
+
+
+def _why_no_predictions(episode: int, predictions: Sequence[Any], demos: Any, target: Target, session: Session) -> str:
+    """Why an episode is shown as it was recorded, and nothing more."""
+    import numpy as np
+
+    if not predictions:
+        base = target.key.split("+")[0]
+        finished = [
+            key for key in session.store.experiments() if (session.store.folder(key, "benchmark_table")).exists()
+        ]
+        others = [key for key in finished if key.split("+")[0] == base and key != target.key]
+        known = f" There are results of {', '.join(others)}." if others else ""
+        return (
+            f"'{target.key}' has no up-to-date predictions in {session.store.root}; showing the recording alone.{known}"
+        )
+    anchors = np.concatenate([p.anchors for p in predictions])
+    held_out = demos.episode_ids[np.unique(np.searchsorted(demos.episode_starts, anchors, side="right") - 1)]
+    some = ", ".join(map(str, held_out[:10]))
+    return f"Episode {episode} was trained on, so no policy was asked about it; held out are {some}{' …' * (len(held_out) > 10)}"
