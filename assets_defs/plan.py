@@ -29,8 +29,8 @@ CODE_VERSIONS = {
     "predictions": "2",
     "rollouts": "1",
     "scored_predictions": "1",
-    "benchmark_table": "3",
-    "benchmark_report": "4",
+    "benchmark_table": "4",
+    "benchmark_report": "5",
     "mcap_log": "1",
     "rerun_recording": "1",
 }

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from pipeline.sinks.text_table import render_table
 from pipeline.statistics.floors import measure_floors
 from pipeline.statistics.radius import radius_floor
-from pipeline.table import build_table, dataset_json, floor_json, json_safe, render_table
+from pipeline.table import build_table, dataset_json, floor_json, json_safe
 from tests.hand_made import STATE_ONLY, random_walks, semantics
 from tests.sinks.making import make_comparison, make_demos, make_gap, make_semantics, make_table, make_verdict
 from tests.statistics.test_metrics import scored, task_of
@@ -19,7 +20,7 @@ ROW = {
     "policy", "method", "chunk", "observations", "seeds", "windows_train", "windows_test", "first_step_mae",
     "first_step_rmse", "first_step_l2", "at_one_second_mae", "whole_chunk_mae", "error_by_horizon",
     "hold_still_by_horizon", "error_by_joint", "params", "train_s", "latency_ms", "vs_hold_still", "scaled", "interval",
-    "interval_method", "verdict", "above_floor", "rollouts",
+    "interval_method", "verdict", "above_floor", "rollouts", "by_task",
 }  # fmt: skip
 
 
@@ -29,7 +30,7 @@ def facts_of(demos, meaning):
         "name": "[bold]tape[/]", "revision": None, "content_hash": demos.content_hash, "episodes": demos.episodes,
         "frames": demos.frames, "fps": demos.fps, "action_names": action.names, "action_units": action.units,
         "action_kinds": meaning.kinds, "tracking_lag": meaning.tracking_lag, "warnings": ["a joint hardly moves"],
-        "source": "not part of the table",
+        "source": "not part of the table", "excluded": demos.excluded, "episode_tasks": demos.tasks,
     }  # fmt: skip
 
 
@@ -56,7 +57,7 @@ def test_it_has_the_shape_that_is_promised(table):
     assert {"dataset", "protocol", "split", "floor", "brackets", "policies", "artifacts"} <= set(table)
     assert set(table["dataset"]) == {
         "name", "revision", "content_hash", "episodes", "frames", "fps", "action_names", "action_units", "action_kinds",
-        "tracking_lag", "warnings",
+        "tracking_lag", "excluded", "warnings",
     }  # fmt: skip
     assert {bracket["words"] for bracket in table["brackets"]} == {
         "refused: 6 episodes are too few to find neighbours in; a floor needs 30"
@@ -113,12 +114,26 @@ def test_a_reader_sees_what_the_numbers_rest_on(table):
     text = drawn(table, 200)
     for words in (
         "[bold]tape[/]", "px", "mlp_k01", "state", "42 % 28–57", "—", "5 folds, 6 held out", "2 seeds × 5 steps",
-        "protocol strict", "95 % interval: t over held-out episodes and seeds, for these folds", "Clopper–Pearson",
+        "protocol strict", "95 % interval: bootstrap-t over held-out episodes and seeds, for these folds", "Clopper–Pearson",
         "floor by radius", "3 comparisons in one family", "no floor of 'state' at the first action: 6 episodes are too few",
         "against", "The lowest first-step error is that of", "No floor can be given at the first action",
     ):  # fmt: skip
         assert words in text
     assert "left out" not in text
+
+
+def test_several_tasks_have_a_table_of_their_own():
+    demos = make_demos()
+    table = make_table(demos, make_semantics(demos))
+    assert "by task" not in drawn(table, 160)
+    for number, row in enumerate(table["policies"]):
+        row["by_task"] = {
+            "[red]pick[/]": {"first_step_mae": 1.25 + number, "episodes": 6, "interval": [1.0, 1.5]},
+            "place": {"first_step_mae": 2.5, "episodes": 4, "interval": None},
+        }
+    text = drawn(table, 160)
+    for words in ("first step MAE by task", "[red]pick[/]", "(4 held out)", "1.250 1.00–1.50", "2.500"):
+        assert words in text
 
 
 @pytest.mark.parametrize("width", [60, 80, 100])

@@ -54,7 +54,7 @@ def show_inspection(facts: Mapping[str, Any], console: Console, said_by_checks: 
         if warning not in said_by_checks:
             console.print(f"[yellow]note:[/] {escape(warning)}", soft_wrap=True)
     console.print()
-    _show_findings(facts["findings"], console)
+    _show_findings(facts["findings"], facts["skipped"], console)
     _show_episodes(facts, console)
 
 
@@ -98,7 +98,6 @@ def _row(facts: Mapping[str, Any], feature: Mapping[str, Any], position: int) ->
     if feature["key"] == "action":
         kind = facts["action_kinds"][position]
         frames = facts["lag_frames"][position]
-        # A velocity worked out between neighbouring states is half a frame early: no lag, for a reader.
         lag = "—" if frames is None else f"{frames:.1f} frames ({1e3 * frames / facts['fps']:.0f} ms)"
         gap = "—" if facts["tracking_lag"][position] is None else f"{facts['tracking_lag'][position]:.4g}"
     if feature["dead"][position]:
@@ -119,12 +118,14 @@ def _wide_range(feature: Mapping[str, Any]) -> str:
     return f"{_number(min(known, default=None))} … {_number(max(known, default=None))}"
 
 
-def _show_findings(findings: Sequence[Mapping[str, Any]], console: Console) -> None:
-    quiet = [check for check in CHECKS if check not in {finding["check"] for finding in findings}]
+def _show_findings(findings: Sequence[Mapping[str, Any]], skipped: Mapping[str, str], console: Console) -> None:
+    found = {finding["check"] for finding in findings}
+    quiet = ", ".join(check for check in CHECKS if check not in found and check not in skipped)
+    left = "".join(f" Not looked at: {check} ({escape(why)})." for check, why in skipped.items())
     if not findings:
-        console.print(f"[green]Nothing looks wrong.[/] Looked for: {', '.join(CHECKS)}.", soft_wrap=True)
+        console.print(f"[green]Nothing looks wrong.[/] Looked at: {quiet}.{left}", soft_wrap=True)
         return
-    console.print(f"[bold]What looks wrong[/]  (nothing by: {', '.join(quiet) or '—'})", soft_wrap=True)
+    console.print(f"[bold]What looks wrong[/]  Found nothing: {quiet or '—'}.{left}", soft_wrap=True)
     for check, group in groupby(findings, key=lambda finding: finding["check"]):
         mine = list(group)
         console.print(f"[yellow]{check}[/]")

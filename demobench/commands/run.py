@@ -167,7 +167,7 @@ def collect(target: Target, plan: Any, session: Session) -> dict[str, Any]:
 
 def show(report: Mapping[str, Any], target: Target, session: Session, marked: str | None = None) -> None:
     """The table and where its files are; `marked` is the address of the row that this is about."""
-    from pipeline.table import render_table
+    from pipeline.sinks.text_table import render_table
 
     console = session.console
     render_table(report, console, marked)

@@ -7,8 +7,8 @@
     alike.py      the same recording twice                        outliers.py  short, long, odd start, odd path
     videos.py     frames of the video files against meta/         labels.py    tasks, units
     look.py       all of them, the episodes to look at, the episodes worth leaving out
-    measure.py    `python -m pipeline.inspection.measure`: false alarms on clean data, hits on planted faults
 
 A detector is a function of a survey (or of demonstrations and semantics) that yields findings. It changes nothing, and
-nothing here decides what a benchmark uses: `exclude` in the configuration does.
+nothing here decides what a benchmark uses: `exclude` in the configuration does. How often detectors are wrong is measured by
+`python -m speed.inspect_faults`.
 """

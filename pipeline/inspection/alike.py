@@ -73,16 +73,24 @@ def _pair(one: int, other: int, shift: int) -> tuple[int, int, int]:
 
 def _points(survey: Survey) -> np.ndarray | None:
     """[N, PROJECTIONS] float32."""
-    living = [(f, int(i)) for f in (ACTION, STATE) for i in np.flatnonzero(~survey.dead[f]) if survey.spans[f][i] > 0]
+    scales = {feature: _scales(survey, feature) for feature in (ACTION, STATE)}
+    living = [(f, int(i)) for f in (ACTION, STATE) for i in np.flatnonzero(scales[f])]
     if not living:
         return None
     weights = np.random.default_rng(0).normal(size=(len(living), PROJECTIONS)) / np.sqrt(len(living))
     points = np.zeros((survey.demos.frames, PROJECTIONS), np.float32)
     for (feature, i), weight in zip(living, weights, strict=True):
-        scaled = survey.demos.columns[feature][:, i] / np.float32(survey.spans[feature][i])
+        scaled = survey.demos.columns[feature][:, i] / np.float32(scales[feature][i])
         for number in range(PROJECTIONS):
             points[:, number] += np.float32(weight[number]) * scaled
     return points
+
+
+def _scales(survey: Survey, feature: str) -> np.ndarray:
+    """[D] the span of each column, or a quarter of its whole range if that is more; 0 for dead columns."""
+    values = survey.demos.columns[feature]
+    whole = values.max(axis=0) - values.min(axis=0)
+    return np.where(survey.dead[feature], 0.0, np.maximum(survey.spans[feature], whole / 4))
 
 
 def _asked(survey: Survey, points: np.ndarray) -> np.ndarray:
@@ -105,10 +113,11 @@ def _compare(survey: Survey, one: int, other: int, shift: int) -> tuple[int, flo
         return 0, np.inf
     total, columns = 0.0, 0
     for feature in (ACTION, STATE):
-        keep = ~survey.dead[feature] & (survey.spans[feature] > 0)
+        scales = _scales(survey, feature)
+        keep = scales > 0
         values = survey.demos.columns[feature]
         a = values[starts[one] + low : starts[one] + high][:, keep]
         b = values[starts[other] + low + shift : starts[other] + high + shift][:, keep]
-        total += float((np.abs(a - b) / survey.spans[feature][keep]).mean(axis=0).sum())
+        total += float((np.abs(a - b) / scales[keep]).mean(axis=0).sum())
         columns += int(keep.sum())
     return high - low, total / max(1, columns)

@@ -51,13 +51,12 @@ def _tasks(survey: Survey) -> Iterator[Finding]:
 def _units(survey: Survey) -> Iterator[Finding]:
     """Action columns that go with the state column of their own name, but in another unit."""
     states = survey.demos.features[STATE].names
-    for column in survey.living(ACTION):
-        if column.name not in states or column.is_rate:
+    for position, name in enumerate(survey.demos.features[ACTION].names):
+        if name not in states:
             continue
-        place = states.index(column.name)
-        if survey.dead[STATE][place]:
+        column, state = survey.column(ACTION, position), survey.column(STATE, states.index(name))
+        if column.is_rate:
             continue
-        state = survey.column(STATE, place)
         factor = _factor(survey, column.values, state.values)
         for ratio, words in _RATIOS.items():
             if factor and abs(math.log(max(factor, 1 / factor) / ratio)) < 0.1:

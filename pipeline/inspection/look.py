@@ -18,7 +18,7 @@ from pipeline.inspection.motion import check_idle, check_jumps
 from pipeline.inspection.outliers import check_outliers, check_short
 from pipeline.inspection.survey import Survey
 from pipeline.inspection.tracking import check_tracking, follow
-from pipeline.inspection.videos import check_videos
+from pipeline.inspection.videos import check_videos, no_videos
 from pipeline.types import Demonstrations, Semantics
 
 LOOK_AT, MOST_SAID = 5, 20
@@ -37,12 +37,14 @@ class Inspection:
     look_at     (episode, what speaks for looking at it), at most LOOK_AT, the first first
     exclude     recorded numbers of the episodes with a grave fault, sorted
     lag_frames  [A] how many frames later than its command each joint moves; None where that is not known
+    skipped     check → why it could not be made
     """
 
     findings: tuple[Finding, ...]
     look_at: tuple[tuple[int, tuple[str, ...]], ...]
     exclude: tuple[int, ...]
     lag_frames: tuple[float | None, ...]
+    skipped: Mapping[str, str]
 
     @property
     def exclude_line(self) -> str:
@@ -54,7 +56,8 @@ class Inspection:
         mine = [finding for finding in self.findings if finding.check == check]
         said = [f.words if f.episode is None else f"Episode {f.episode}: {f.words}" for f in mine[:MOST_SAID]]
         more = [f"… and {len(mine) - MOST_SAID} more."] if len(mine) > MOST_SAID else []
-        return not mine, " ".join([*said, *more]) or "nothing looks wrong"
+        fine = f"not looked at: {self.skipped[check]}" if check in self.skipped else "nothing looks wrong"
+        return not mine, " ".join([*said, *more]) or fine
 
     def as_json(self, argument: str) -> dict[str, Any]:
         """The keys that `demobench inspect --json` adds; `argument` is how the user names the data set."""
@@ -67,6 +70,7 @@ class Inspection:
             ],
             "exclude": list(self.exclude),
             "exclude_line": self.exclude_line,
+            "skipped": dict(self.skipped),
         }
 
 
@@ -108,6 +112,7 @@ def inspect(
     return Inspection(
         findings, _look_at(findings), tuple(exclude) if len(exclude) <= MOST_EXCLUDED * demos.episodes else (),
         _lags(semantics, {following.column.position: following.lag for following in followings}),
+        {"video": why} if (why := no_videos(demos, folder)) else {},
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ SHORT_S, SHORT_FRAMES = 1.0, 10
 FEWEST = 5
 """Episodes below which nothing is called unlike the others."""
 
-LENGTH, DEVIATIONS = 2.5, 5.0
+LENGTH, DEVIATIONS = 2.5, 4.0
 """How many times longer or shorter than the median, and how many deviations of the logarithm, an odd length is."""
 
 POINTS = 16
@@ -26,6 +26,9 @@ POINTS = 16
 
 START, PATH = 0.2, 0.25
 """Least distance of an odd start from the next, and of an odd path, in spans of the columns (root mean square)."""
+
+SAME_PLACE = 0.01
+"""Distances below this are alike: poses that an encoder reads as equal are not infinitely closer than others."""
 
 ODD = 6.0
 """Deviations, of the logarithm of the distance to the nearest episodes, from which a start or path is odd."""
@@ -104,7 +107,7 @@ def _nearest(vectors: np.ndarray) -> np.ndarray:
 
 def _odd(distance: np.ndarray, least: float) -> tuple[np.ndarray, float]:
     """Which distances stand out, and from what on."""
-    centre, deviation = robust(np.log(np.maximum(distance, 1e-6)))
+    centre, deviation = robust(np.log(np.maximum(distance, SAME_PLACE)))
     limit = max(least, float(np.exp(centre + ODD * max(deviation, 0.1))))
     return np.flatnonzero(distance > limit), limit
 

@@ -13,8 +13,8 @@ from pipeline.inspection.finding import Finding
 from pipeline.inspection.survey import Column, Survey, per_episode, robust
 from pipeline.types import ACTION, STATE
 
-EARLY, LATE_S, LONGEST = 3, 1.0, 40
-"""Lags looked at: from three frames early to a second, at most 40 frames, late."""
+EARLY, LATE_S, LONGEST = 10, 1.0, 40
+"""Lags looked at: from ten frames early to a second, at most 40 frames, late."""
 
 FOLLOWS, DOES_NOT = 0.6, 0.3
 """Correlation from which a joint follows its command, and below which it does not."""
@@ -80,7 +80,7 @@ def _follow(survey: Survey, command: Column, state: Column) -> Following:
 
 def _correlate(survey: Survey, told: np.ndarray, done: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lags [L] and Σ told_t · done_{t + lag} [L, E] within each episode."""
-    late = int(min(LONGEST, survey.frames(LATE_S, least=EARLY), survey.demos.lengths.max()))
+    late = int(min(LONGEST, survey.frames(LATE_S, least=3), survey.demos.lengths.max()))
     lags = np.arange(-EARLY, late + 1)
     table = np.empty((len(lags), survey.demos.episodes))
     left = np.repeat(survey.starts[1:], survey.demos.lengths) - np.arange(survey.demos.frames)  # frames to the end

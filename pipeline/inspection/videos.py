@@ -4,7 +4,7 @@ What does not belong here: whether a declared camera has files at all (the reade
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -39,21 +39,29 @@ def local_folder(source: str, config_dir: Path) -> Path | None:
     return folder if folder.is_dir() else None
 
 
-def check_videos(
-    demos: Demonstrations, folder: Path | None, on_file: Callable[[int, int], None] | None = None
-) -> Iterator[Finding]:
-    """`on_file(done, total)` is told of every file looked at."""
-    cameras = [camera for camera in demos.cameras if camera.present]
-    if folder is None or not cameras:
+def no_videos(demos: Demonstrations, folder: Path | None) -> str | None:
+    """Why there are no video files to look at, if so."""
+    if not demos.cameras:
+        return "it has no cameras"
+    if folder is None:
+        return "only the videos of data sets in a folder are looked at"
+    if not any(camera.present for camera in demos.cameras):
+        return "its video files are absent"
+    return None
+
+
+def check_videos(demos: Demonstrations, folder: Path | None) -> Iterator[Finding]:
+    """Every file of the cameras whose files are there.
+
+    Raises:
+        DatasetError: meta/ cannot be read.
+    """
+    if folder is None or no_videos(demos, folder):
         return
-    listed = {camera.key: _listed(folder, camera.key) for camera in cameras}
-    total, done = sum(map(len, listed.values())), 0
-    for camera in cameras:
-        for name, file in listed[camera.key].items():
-            yield from _look(demos, folder, camera, name, file)
-            done += 1
-            if on_file:
-                on_file(done, total)
+    for camera in demos.cameras:
+        if camera.present:
+            for name, file in _listed(folder, camera.key).items():
+                yield from _look(demos, folder, camera, name, file)
 
 
 def _listed(folder: Path, key: str) -> dict[str, _File]:

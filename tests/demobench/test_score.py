@@ -11,7 +11,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner
 
+from demobench.cli import app
+from pipeline.errors import DemobenchError
+from pipeline.external.reading import read_answers
 from pipeline.predict import load_predictions
 from tests.demobench.test_cli import demobench
 from tests.makers import tiny_demonstrations, tiny_recording, write_v3
@@ -67,6 +71,69 @@ def rows_of(place: Path, file: str) -> dict:
 
 
 @pytest.fixture(scope="module")
+def unused(tmp_path_factory) -> Path:
+    """A data set that was never benchmarked, a good file of predictions and one with its columns swapped."""
+    place = tmp_path_factory.mktemp("unused")
+    write_v3(place / "tape", tiny_recording(episodes=12, frames=30))
+    (place / "demobench.toml").write_text(CONFIG)
+    recorded = tiny_demonstrations(12, 30).columns["action"]
+    noisy = recorded + 0.1 * np.random.default_rng(0).normal(size=recorded.shape)
+    frames = {"episode_index": np.arange(360) // 30, "frame_index": np.arange(360) % 30}
+    for name, actions in (("ours", noisy), ("swapped", noisy[:, ::-1])):
+        pq.write_table(pa.table({**frames, "action": actions[:, None].tolist()}), place / f"{name}.parquet")
+    return place
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["absent.parquet"], ["cannot be read: No such file"]),
+        (["ours.parquet", "--remove", "x"], ["PREDICTIONS and --remove are different things"]),
+        (["ours.parquet", "--name", "hold_still"], ["'hold_still' is a policy of 'tape'"]),
+        (["ours.parquet", "--name", "../x"], ["../x"]),
+        (["ours.parquet", "--observations", "stat"], ["no observation set 'stat'", "Did you mean 'state'"]),
+        (["ours.parquet", "--trained-on", "none.json"], ["none.json, named by --trained-on, cannot be read"]),
+        (["--remove", "our"], ["Nothing was scored under the name 'our'"]),
+        (["--lerobot", "tape"], ["--lerobot-python PATH", "go together"]),
+        (["--write-anchors", "a.parquet", "--fold", "4"], ["There is no fold 4", "4 folds, 0 to 3"]),
+        (["--write-anchors", "none/a.parquet"], ["cannot be written to"]),
+        (["ours.parquet", "--fold", "1"], ["--fold says which anchors"]),
+        (["swapped.parquet"], ["swapped.parquet: action columns are permuted: joint_0 holds joint_1"]),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_one_message_before_any_work(unused, monkeypatch, words, expected):
+    monkeypatch.chdir(unused)
+    found = CliRunner().invoke(app, ["score", "tape", *words])
+    assert isinstance(found.exception, DemobenchError), found.output
+    for expectation in expected:
+        assert expectation in str(found.exception)
+    assert not list(unused.rglob("made.json"))
+    assert not list(unused.rglob("*.draft"))
+
+
+def test_anchors_are_written_for_all_episodes_or_a_fold(unused, monkeypatch):
+    monkeypatch.chdir(unused)
+    out = CliRunner().invoke(app, ["score", "tape", "--write-anchors", "all.parquet"]).output
+    assert "336 anchors of 12 episodes" in " ".join(out.split())
+    out = CliRunner().invoke(app, ["score", "tape", "--write-anchors", "one.parquet", "--fold", "1"]).output
+    assert "84 anchors of 3 episodes" in " ".join(out.split())
+    assert set(pq.read_table("one.parquet")["fold"].to_pylist()) == {1}
+    assert "Nothing was scored yet" in CliRunner().invoke(app, ["score", "tape"]).output
+
+
+def test_the_documented_example_fills_the_anchors(unused, monkeypatch):
+    """The page's own code, in the page's own words: what it writes can be read."""
+    monkeypatch.chdir(unused)
+    CliRunner().invoke(app, ["score", "tape", "--write-anchors", "anchors.parquet"])
+    (code,) = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
+    assert len(code.strip().splitlines()) <= 12
+    exec(code, {})
+    answers = read_answers(unused / "my_act.parquet", tiny_demonstrations(12, 30), 3)
+    assert len(answers.covered) == 3
+    assert answers.actions.shape[3:] == (16, 2)
+
+
+@pytest.fixture(scope="module")
 def split(place) -> dict:
     for words in (["--out", "split.json"], ["--fold", "1", "--out", "fold1.json"]):
         out = demobench("split", "tape", "--format", "json", *words, cwd=place)
@@ -80,27 +147,7 @@ def scored(place, split) -> subprocess.CompletedProcess:
     return demobench("score", "tape", *words, cwd=place)
 
 
-def test_the_split_is_that_of_the_benchmark(place, split):
-    (table,) = json.loads((place / "run.json").read_text())
-    assert split["folds"] == table["split"]["folds"]
-    assert split["split_hash"] == table["split"]["hash"]
-    assert split["fold"] is None
-    assert json.loads((place / "fold1.json").read_text())["fold"] == 1
-    text = demobench("split", "tape", cwd=place).stdout
-    assert f"3: {', '.join(map(str, split['folds'][2]['test']))}" in text
-    assert json.loads(demobench("split", "tape", "--json", "-", cwd=place).stdout) == split
-    other = json.loads(demobench("split", "tape", "--folds", "1", "--json", "-", cwd=place).stdout)
-    assert len(other["folds"]) == 1
-
-
-def test_lerobots_trainer_takes_the_training_episodes(place, split):
-    out = demobench("split", "tape", "--format", "lerobot", "--fold", "1", cwd=place).stdout
-    (line,) = [line for line in out.splitlines() if not line.startswith("#")]
-    found = re.fullmatch(r'--dataset\.episodes="(\[[\d,]+\])"', line)
-    assert json.loads(found[1]) == split["folds"][1]["train"]
-    assert f"# Held out (3): {split['folds'][1]['test']}" in out
-
-
+@pytest.mark.slow
 def test_our_own_predictions_sent_as_a_file_are_our_own_row(place, scored):
     assert scored.returncode == 0, scored.stderr
     assert "→ ours" in scored.stdout
@@ -120,6 +167,7 @@ def test_our_own_predictions_sent_as_a_file_are_our_own_row(place, scored):
     assert (pair["difference"], pair["words"]) == (0.0, "the two predict the same")
 
 
+@pytest.mark.slow
 def test_it_makes_what_was_missing_and_nothing_again(place, scored):
     made = {
         line.split()[-3] for line in scored.stderr.splitlines() + scored.stdout.splitlines() if line.startswith("[")
@@ -131,6 +179,7 @@ def test_it_makes_what_was_missing_and_nothing_again(place, scored):
     assert "is up to date: nothing to compute" in demobench("run", "tape", cwd=place).stdout
 
 
+@pytest.mark.slow
 def test_it_is_compared_viewed_and_listed_like_any_policy(place, scored):
     out = demobench("compare", "tape/ours", "tape/hold_still", "--json", "-", cwd=place)
     assert out.returncode == 0, out.stderr
@@ -145,6 +194,7 @@ def test_it_is_compared_viewed_and_listed_like_any_policy(place, scored):
     assert "predicted elsewhere" in page
 
 
+@pytest.mark.slow
 def test_only_what_was_not_trained_on_counts(place, scored, split):
     train, test = split["folds"][1]["train"], split["folds"][1]["test"]
     export(place, "some.parquet", episodes=[*test, train[0]])
@@ -157,6 +207,7 @@ def test_only_what_was_not_trained_on_counts(place, scored, split):
     assert "1 more were predicted but trained on, and are left out" in " ".join(out.stdout.split())
 
 
+@pytest.mark.slow
 def test_seen_in_training_has_no_verdict_and_can_be_taken_out_again(place, scored):
     (place / "all.json").write_text(json.dumps({"dataset": {"repo_id": "me/tape", "episodes": None}}))
     words = ["--name", "seen", "--trained-on", "all.json", "--observations", "state", "--json", "seen.json"]
@@ -176,6 +227,7 @@ def test_seen_in_training_has_no_verdict_and_can_be_taken_out_again(place, score
     assert demobench("score", "tape", "--remove", "seen", cwd=place).returncode == 2
 
 
+@pytest.mark.slow
 def test_the_documented_example_runs(place, scored):
     """The page's own code fills the anchors that the command writes; without --trained-on nothing is known."""
     folder = place / "doc"
@@ -196,44 +248,7 @@ def test_the_documented_example_runs(place, scored):
     assert all("nothing is known about the episodes it was trained on" in w for w in words)
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["absent.parquet"], ["cannot be read: No such file"]),
-        (["ours.parquet", "--remove", "x"], ["PREDICTIONS and --remove are different things"]),
-        (["ours.parquet", "--name", "hold_still"], ["'hold_still' is a policy of 'tape'"]),
-        (["ours.parquet", "--name", "../x"], ["../x"]),
-        (["ours.parquet", "--observations", "stat"], ["no observation set 'stat'", "Did you mean 'state'"]),
-        (["ours.parquet", "--trained-on", "none.json"], ["none.json, named by --trained-on, cannot be read"]),
-        (["--remove", "our"], ["Nothing was scored under the name 'our'"]),
-        (["--lerobot", "tape"], ["--lerobot-python PATH", "go together"]),
-        (["--write-anchors", "a.parquet", "--fold", "4"], ["There is no fold 4", "4 folds, 0 to 3"]),
-        (["--write-anchors", "none/a.parquet"], ["cannot be written to"]),
-        (["ours.parquet", "--fold", "1"], ["--fold says which anchors"]),
-        (["swapped.parquet"], ["swapped.parquet: action columns are permuted: joint_0 holds joint_1"]),
-    ],
-)  # fmt: skip
-def test_a_mistake_is_one_message_and_changes_nothing(place, scored, words, expected):
-    swapped = tiny_demonstrations(12, 30).columns["action"]
-    last = np.arange(30 * 12) // 30 * 30 + 29
-
-    def the_wrong_way_round(values):
-        p = load_predictions(place / "results/datasets/tape/mlp_k04/predictions/state")
-        frames = np.minimum(p.anchors[:, None] + np.arange(values.shape[2]), last[p.anchors][:, None])
-        return np.stack([swapped[frames][..., ::-1]] * 2)
-
-    if words == ["swapped.parquet"]:
-        export(place, "swapped.parquet", change=the_wrong_way_round)
-    before = sorted((p, p.stat().st_mtime_ns) for p in (place / "results/datasets").rglob("made.json"))
-    out = demobench("score", "tape", *words, cwd=place)
-    assert out.returncode == 2, out.stdout
-    assert "Traceback" not in out.stderr
-    for expectation in expected:
-        assert expectation in " ".join(out.stderr.split())
-    assert sorted((p, p.stat().st_mtime_ns) for p in (place / "results/datasets").rglob("made.json")) == before
-    assert not list(place.rglob("*.draft"))
-
-
+@pytest.mark.slow
 def test_a_row_of_other_data_leaves_the_table_with_a_word(place, scored):
     """The data set changes: what was scored on it before no longer counts, and the run says so."""
     other = place / "other"

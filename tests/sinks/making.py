@@ -87,7 +87,7 @@ def make_row(policy: str, method: str, demos: Demonstrations, *, error: float = 
         "error_by_joint": {name: error + i for i, name in enumerate(names)}, "vs_hold_still": 20 / error,
         "scaled": error / 100, "scaled_by_joint": dict.fromkeys(names, error / 100),
         "ensembled_first_step_mae": None, "interval": {"first_step_mae": [0.9 * error, 1.1 * error]},
-        "interval_method": "bootstrap-t", "params": 0, "train_s": 0.0, "latency_ms": 0.12, "verdict": make_verdict(),
+        "interval_method": "bootstrap-t", "by_task": {}, "params": 0, "train_s": 0.0, "latency_ms": 0.12, "verdict": make_verdict(),
         "above_floor": [], "rollouts": None,
     } | more  # fmt: skip
 
