@@ -4,6 +4,6 @@ From Python: `read`, `split`, `windows`, `floor`, `predict`, `score`, `compare` 
 `demobench --help`.
 """
 
-from demobench.api import Dataset, compare, floor, predict, read, score, split, windows
+from demobench.api import Dataset, Scored, compare, floor, predict, read, score, split, windows
 
-__all__ = ["Dataset", "compare", "floor", "predict", "read", "score", "split", "windows"]
+__all__ = ["Dataset", "Scored", "compare", "floor", "predict", "read", "score", "split", "windows"]

@@ -17,12 +17,19 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config import BUDGETS, DatasetConfig, PolicyConfig, find_config, load_config
 from pipeline.errors import ConfigError, did_you_mean
 from pipeline.experiment import Choices, Experiment, Variant, resolve_target, variants
-from pipeline.types import Demonstrations, FloorEstimate, ObservationSet, Predictions, Semantics, Split
+from pipeline.types import (
+    Demonstrations,
+    EpisodeErrors,
+    FloorEstimate,
+    ObservationSet,
+    Predictions,
+    Semantics,
+    Split,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from pipeline.folds import PolicyTask
     from pipeline.statistics.comparisons import Comparison
-    from pipeline.statistics.metrics import Score
     from pipeline.windows import Windows
 
 
@@ -170,29 +177,73 @@ def predict(
     return join_folds(parts)
 
 
-def score(data: Dataset, predictions: Predictions) -> "Score":
-    """The errors of predictions on held-out episodes: `.metrics` (as in a row of the table), `.errors` by episode."""
+@dataclass(frozen=True)
+class Scored:
+    """Predictions with their errors on held-out episodes.
+
+    address   policy/observations        metrics  as in a row of the table
+    errors    by episode                 trained  whether the policy has seeds
+    seen      whether it was trained on the episodes it is scored on; None: nothing is known
+    warnings  what looks wrong with predictions made elsewhere
+    """
+
+    address: str
+    metrics: dict[str, Any]
+    errors: EpisodeErrors
+    trained: bool
+    seen: bool | None = False
+    warnings: tuple[str, ...] = ()
+
+
+def score(
+    data: Dataset, predictions: Predictions | str | Path, *, name: str | None = None, trained_on: Path | None = None
+) -> Scored:
+    """Score predictions: those of `predict`, or a parquet file that was made anywhere (docs/scoring.md).
+
+    `name` and `trained_on` (a split, a list of episodes, LeRobot's train_config.json) belong to a file.
+
+    Raises
+    ------
+    DatasetError : the file cannot be read, or is not aligned with what was recorded.
+    """
     from pipeline.statistics.metrics import score_task
 
-    return score_task(_task_of(data, predictions), predictions)
+    if isinstance(predictions, Predictions):
+        task = _task_of(data, predictions)
+        found = score_task(task, predictions)
+        address = f"{predictions.policy}/{predictions.observations}"
+        return Scored(address, found.metrics, found.errors, task.variant.is_trained)
+    return _score_file(data, Path(predictions), name, trained_on)
 
 
-def compare(data: Dataset, *predictions: Predictions, horizon: int = 0) -> "list[Comparison]":
-    """All pairs of some predictions, paired by episode, at one horizon: better, worse, cannot tell, not comparable.
+def _score_file(data: Dataset, path: Path, name: str | None, trained_on: Path | None) -> Scored:
+    from pipeline.external.scoring import score_file
+    from pipeline.external.training import read_training
+
+    found = score_file(
+        path, name=name or path.stem, observations=None,
+        training=read_training(Path(trained_on), data.demos) if trained_on else None, demos=data.demos,
+        semantics=data.semantics, split=split(data), experiment=data.experiment,
+    )  # fmt: skip
+    address = f"{found.predictions.policy}/{found.predictions.observations}"
+    return Scored(address, found.score.metrics, found.score.errors, True, found.held_out.seen, found.warnings)
+
+
+def compare(data: Dataset, *rows: Scored | Predictions, horizon: int = 0) -> "list[Comparison]":
+    """All pairs of some rows, paired by the episodes that both hold out: better, worse, cannot tell, not comparable.
 
     p is corrected (Holm 1979) for all pairs of this call. `horizon` counts steps ahead: 0 is the first action.
     """
-    from pipeline.statistics.comparisons import compare_errors, judge
+    from pipeline.external.pairing import Rival, compare_common
+    from pipeline.statistics.comparisons import judge
 
-    scored = [(f"{p.policy}/{p.observations}", _task_of(data, p), p) for p in predictions]
-    errors = {name: score(data, one).errors for name, _, one in scored}
+    scored = [row if isinstance(row, Scored) else score(data, row) for row in rows]
+    rivals = [Rival(one.address, one.errors, one.trained, one.seen) for one in scored]
     metric = "first_step_mae" if horizon == 0 else f"mae_at_step_{horizon}"
-    found = []
-    for (a, task_a, _), (b, task_b, _) in combinations(scored, 2):
-        trained = (task_a.variant.is_trained, task_b.variant.is_trained)
-        pair = compare_errors(errors[a], errors[b], horizon, data.experiment.protocol, trained=trained)
-        found.append((a, b, metric, pair))
-    return judge(found)
+    pairs = combinations(rivals, 2)
+    return judge(
+        [(a.address, b.address, metric, compare_common(a, b, horizon, data.experiment.protocol)) for a, b in pairs]
+    )
 
 
 def _observation_set(data: Dataset, name: str | None) -> ObservationSet:

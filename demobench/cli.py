@@ -293,6 +293,13 @@ def score(
         Path | None, typer.Option(metavar="PATH", help="The Python of the environment that has LeRobot.")
     ] = None,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Where the LeRobot checkpoint is asked.")] = "cpu",
+    lerobot_feature: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=COLUMN",
+            help="A feature of the checkpoint and the data set's that it is shown. May be repeated.",
+        ),
+    ] = None,
     remove: Annotated[str | None, typer.Option(metavar="NAME", help="Take a row that was scored out again.")] = None,
     config: ConfigOption = None,
     store: StoreOption = None,
@@ -312,6 +319,7 @@ def score(
         lerobot=lerobot,
         lerobot_python=lerobot_python,
         device=device,
+        features=lerobot_feature or (),
         remove=remove,
         config_path=config,
         store_path=store,

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.by_task import errors_by_task
 from pipeline.experiment import Experiment
-from pipeline.external.pairing import Rival, compare_elsewhere
+from pipeline.external.pairing import Rival, judge_with_elsewhere
 from pipeline.statistics.brackets import Scored, Sight, form_brackets, gap_to_floor, sight_of, value_of_sensors
 from pipeline.statistics.comparisons import table_comparisons
 from pipeline.types import FloorEstimate, RadiusFloor, Split
@@ -94,13 +94,8 @@ def _compare(
     champion = experiment.dataset.champion
     baselines = [entry["variant"].name for entry in ours if not entry["variant"].is_trained]
     found = table_comparisons(scored, champion, facts["fps"], experiment.protocol, baselines=baselines)
-    rivals = {comparison.b for comparison in found}
-    found += compare_elsewhere(
-        [_rival(entry) for entry in entries if "elsewhere" in entry],
-        [one for one in map(_rival, ours) if one.address in rivals],
-        facts["fps"],
-        experiment.protocol,
-    )
+    elsewhere = [_rival(entry) for entry in entries if "elsewhere" in entry]
+    found = judge_with_elsewhere(found, [_rival(entry) for entry in ours], elsewhere, facts["fps"], experiment.protocol)
     by_address = {f"{row['policy']}/{row['observations']}": row for row in rows}
     for comparison in found:
         rival = "vs_hold_still" if comparison.b.startswith("hold_still/") else "vs_champion"

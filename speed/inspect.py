@@ -1,66 +1,91 @@
-"""Inspecting: fifty episodes against reading them alone, and a million frames of (6 + 6) columns, with their memory.
+"""`demobench inspect`: 50 episodes, and a million frames; seconds, and memory against the columns that are read."""
 
-The long recording is the embedded data set over and over, each time elsewhere and with noise of its own, six joints of
-its two: real motion, nothing twice. It is made in memory: reading is measured on what lies on disk.
-"""
-
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from pipeline.inspection.look import inspect
-from pipeline.lerobot_format.quality import resolve_semantics
-from pipeline.lerobot_format.read import load_source
-from pipeline.types import ACTION, STATE, Demonstrations, Feature
+from pipeline.lerobot_format.quality import inspect_dataset, resolve_semantics
+from pipeline.lerobot_format.write import write_dataset
+from pipeline.types import ACTION, STATE, Demonstrations
+from speed.planted import made_arm
 from speed.timing import peak_mb, seconds
 
-EPISODES, FRAMES, JOINTS = 50, 1_000_000, 6
+MILLION = 1_000_000
+
+_COMMAND = """
+import json, resource, sys, time
+sys.argv = ["demobench", "inspect", {folder!r}, "--json", {out!r}]
+from demobench.cli import main
+began = time.perf_counter()
+try:
+    main()
+except SystemExit as end:
+    assert not end.code, end.code
+took, peak = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(json.dumps([took, peak / 1024]))
+"""
 
 
-def some(demos: Demonstrations, episodes: int) -> Demonstrations:
-    """The first episodes."""
-    stop = int(demos.episode_starts[episodes])
-    return replace(
-        demos, columns={key: values[:stop] for key, values in demos.columns.items()},
-        episode_starts=demos.episode_starts[: episodes + 1], episode_ids=demos.episode_ids[:episodes],
-        timestamps=demos.timestamps[:stop], tasks=demos.tasks[:episodes],
-    )  # fmt: skip
-
-
-def long_recording(demos: Demonstrations, frames: int) -> Demonstrations:
-    """At least so many frames; state and action only, JOINTS columns of each."""
+def many(demos: Demonstrations, copies: int) -> Demonstrations:
+    """The same demonstrations so many times over, every copy scaled and moved a little: none is another's duplicate."""
     random = np.random.default_rng(0)
-    times = -(-frames // demos.frames)
-    names = tuple(f"joint_{joint}.pos" for joint in range(JOINTS))
-    columns = {key: np.empty((times * demos.frames, JOINTS), np.float32) for key in (STATE, ACTION)}
-    for place in range(times):
-        rows = slice(place * demos.frames, (place + 1) * demos.frames)
-        for joint in range(JOINTS):
-            stretch = random.uniform(0.8, 1.2, demos.episodes)[demos.episode_of_frame]
-            for key, values in columns.items():
-                noise = random.normal(0, 0.5, demos.frames)
-                values[rows, joint] = stretch * demos.columns[key][:, joint % 2] + noise
-    lengths = np.tile(demos.lengths, times)
+    columns = {}
+    for key, values in demos.columns.items():
+        factors = 1 + 0.05 * random.normal(size=(copies, 1, 1))
+        moved = 0.05 * np.ptp(values, axis=0) * random.normal(size=(copies, 1, values.shape[1]))
+        columns[key] = (values[None] * factors + moved).reshape(-1, values.shape[1]).astype(np.float32)
+    lengths = np.tile(demos.lengths, copies)
     return replace(
-        demos, columns=columns, features={key: Feature(key, names, (None,) * JOINTS) for key in columns},
-        episode_starts=np.concatenate([[0], np.cumsum(lengths)]), episode_ids=np.arange(len(lengths)),
-        timestamps=np.tile(demos.timestamps, times), tasks=demos.tasks * times,
+        demos, columns=columns, episode_starts=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        episode_ids=np.arange(len(lengths)), timestamps=np.tile(demos.timestamps, copies), tasks=demos.tasks * copies,
     )  # fmt: skip
 
 
-def measure(demos: Demonstrations) -> list[str]:
-    semantics = resolve_semantics(demos)
-    fifty = some(demos, EPISODES)
-    read = seconds(lambda: load_source(demos.source, name=demos.name, config_dir=Path.cwd()))
-    short = seconds(lambda: inspect(fifty, semantics))
-    long = long_recording(demos, FRAMES)
-    meaning = resolve_semantics(long)
-    whole = seconds(lambda: inspect(long, meaning))
-    memory = peak_mb(lambda: inspect(long, meaning))
-    size = sum(values.nbytes for values in long.columns.values()) / 1e6
+def looked_at(demos: Demonstrations) -> Callable[[], object]:
+    def work() -> object:
+        semantics = resolve_semantics(demos)
+        return inspect(demos, semantics), inspect_dataset(demos, semantics)
+
+    return work
+
+
+def of_command(demos: Demonstrations) -> tuple[float, float]:
+    """Seconds and peak resident MB of the command on a folder, imports left out of the seconds."""
+    with TemporaryDirectory() as place:
+        folder, out = Path(place) / "set", Path(place) / "out.json"
+        features = {key: (demos.features[key].names, demos.columns[key], "float32") for key in (ACTION, STATE)}
+        write_dataset(
+            folder, fps=demos.fps, features=features, episode_lengths=demos.lengths.tolist(), tasks=demos.tasks,
+            robot_type=None,
+        )  # fmt: skip
+        code = _COMMAND.format(folder=str(folder), out=str(out))
+        run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+        return tuple(json.loads(run.stdout.strip().splitlines()[-1]))
+
+
+def measure() -> list[str]:
+    small = made_arm(50, 0)
+    large = many(small, -(-MILLION // small.frames))
+    columns_mb = sum(values.nbytes for values in large.columns.values()) / 1e6
+    small_s, small_mb = of_command(small)
+    large_s, large_mb = of_command(large)
     return [
-        f"inspecting {EPISODES} episodes ({fifty.frames:,} frames): {short:.2f} s; reading all {demos.episodes}: {read:.2f} s",
-        f"inspecting {long.frames:,} frames of {JOINTS} + {JOINTS} columns in {long.episodes:,} episodes: {whole:.1f} s; peak "
-        f"memory {memory:.0f} MB beside the columns' {size:.0f} MB, {memory / size:.2f} times",
+        f"inspect, {small.episodes} episodes ({small.frames:,} frames, 12 columns): {small_s:.1f} s with reading, detectors alone "
+        f"{min(seconds(looked_at(small)) for _ in range(3)):.2f} s",
+        f"inspect, {large.episodes:,} episodes ({large.frames:,} frames, {columns_mb:.0f} MB of columns): {large_s:.1f} s with "
+        f"reading, detectors alone {seconds(looked_at(large)):.1f} s, at {peak_mb(looked_at(large)) / columns_mb:.1f} times the "
+        f"columns' memory beside them; the whole process peaks at {large_mb:.0f} MB, {large_mb - small_mb:.0f} more than with 50 episodes",
     ]
+
+
+if __name__ == "__main__":
+    began = time.perf_counter()
+    print("\n".join(measure()))

@@ -7,7 +7,7 @@ What belongs here: from the command's arguments to a run and its table. What doe
 import json
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from rich.markup import escape
 
 from demobench.commands.run import check_source, collect, materialise, show
 from demobench.commands.session import Session, open_dataset, open_session, write_json_to
-from pipeline.errors import ConfigError, NotApplicableError, StoreError
+from pipeline.errors import ConfigError, NotApplicableError, StoreError, did_you_mean
 from pipeline.experiment import Target
 from pipeline.store import write_json
 
@@ -37,6 +37,16 @@ class Opened:
     semantics: "Semantics"
 
 
+@dataclass(frozen=True)
+class LeRobot:
+    """A checkpoint and how it is asked; `features`: a feature of the checkpoint → the data set's feature it is shown."""
+
+    checkpoint: Path
+    python: Path
+    device: str
+    features: Mapping[str, str]
+
+
 def run_score(
     dataset: str,
     predictions: Path | None,
@@ -49,6 +59,7 @@ def run_score(
     lerobot: Path | None,
     lerobot_python: Path | None,
     device: str,
+    features: Sequence[str],
     remove: str | None,
     config_path: Path | None,
     store_path: str | None,
@@ -83,7 +94,8 @@ def run_score(
     elif predictions is not None:
         _score(opened, _request(opened, predictions, name, trained_on, observations), json_to)
     else:
-        _score(opened, _ask_lerobot(opened, lerobot, lerobot_python, name, trained_on, observations, device), json_to)
+        ask = LeRobot(lerobot, lerobot_python, device, _features(features, opened.demos))
+        _score(opened, _ask_lerobot(opened, ask, name, trained_on, observations), json_to)
 
 
 def _plan(opened: Opened, asked: Mapping[str, Any] | None = None) -> "Plan":
@@ -141,13 +153,7 @@ def _slug(words: str) -> str:
 
 
 def _ask_lerobot(
-    opened: Opened,
-    checkpoint: Path,
-    python: Path,
-    name: str | None,
-    trained_on: Path | None,
-    observations: str | None,
-    device: str,
+    opened: Opened, ask: LeRobot, name: str | None, trained_on: Path | None, observations: str | None
 ) -> "Request":
     """Predict with a LeRobot checkpoint, unless the same was predicted before."""
     from pipeline.external.anchors import require_strict, write_anchors
@@ -156,6 +162,7 @@ def _ask_lerobot(
 
     experiment, demos, store = opened.target.experiment, opened.demos, opened.session.store
     require_strict(experiment.protocol)
+    checkpoint = ask.checkpoint
     if not checkpoint.is_dir():
         raise ConfigError(
             f"The checkpoint {checkpoint} is no folder. Name the pretrained_model folder, or that of its run."
@@ -170,6 +177,7 @@ def _ask_lerobot(
         "data": demos.content_hash,
         "episodes": episodes,
         "history": experiment.history,
+        "features": dict(ask.features),
     }
     if request.predictions.exists() and _read_stamp(request.predictions) == stamp:
         return request
@@ -177,11 +185,34 @@ def _ask_lerobot(
     anchors = folder / f".{request.name}.anchors.parquet"
     try:
         write_anchors(anchors, demos, split_of(experiment, demos), experiment.history, episodes)
-        _predict(opened, checkpoint, python, anchors, request.predictions, device)
+        _predict(opened, ask, anchors, request.predictions)
     finally:
         anchors.unlink(missing_ok=True)
     write_json(request.predictions.with_suffix(".json"), stamp)
     return request
+
+
+def _features(pairs: Sequence[str], demos: "Demonstrations") -> dict[str, str]:
+    """`observation.environment_state=observation.state` as a mapping.
+
+    Raises:
+        ConfigError: it is no pair, or the data set has no such feature.
+    """
+    found = {}
+    for pair in pairs:
+        name, equals, column = pair.partition("=")
+        if not (name and equals and column):
+            raise ConfigError(
+                f"--lerobot-feature takes CHECKPOINTS_NAME=DATA_SETS_NAME, not '{pair}', for example "
+                "observation.environment_state=observation.state."
+            )
+        known = [*demos.features, *(camera.key for camera in demos.cameras)]
+        if column not in known:
+            raise ConfigError(
+                f"--lerobot-feature: the data set has no feature '{column}'. {did_you_mean(column, known)}"
+            )
+        found[name] = column
+    return found
 
 
 def _checkpoint_name(checkpoint: Path) -> str:
@@ -224,7 +255,7 @@ def _read_stamp(predictions: Path) -> Any:
         return None
 
 
-def _predict(opened: Opened, checkpoint: Path, python: Path, anchors: Path, out: Path, device: str) -> None:
+def _predict(opened: Opened, ask: LeRobot, anchors: Path, out: Path) -> None:
     from demobench.progress import counting_bar
     from pipeline.inspection.videos import local_folder
     from pipeline.lerobot_bridge import predict_with_lerobot
@@ -237,7 +268,16 @@ def _predict(opened: Opened, checkpoint: Path, python: Path, anchors: Path, out:
             "Name a folder that holds it."
         )
     with counting_bar(session.console, "anchors", 1) as count:
-        facts = predict_with_lerobot(checkpoint, python, folder, anchors, out, device=device, on_progress=count)
+        facts = predict_with_lerobot(
+            ask.checkpoint,
+            ask.python,
+            folder,
+            anchors,
+            out,
+            device=ask.device,
+            features=ask.features,
+            on_progress=count,
+        )
     session.console.print(
         f"{escape(facts.policy_type)}, {facts.parameters:,} weights, {facts.chunk} actions a call, sees "
         f"{escape(', '.join(dict.fromkeys(facts.observations)))}",

@@ -64,17 +64,32 @@ def compare_common(a: Rival, b: Rival, horizon: int, protocol: Protocol) -> Pair
     return found if isinstance(found, str) or whole else replace(found, sampled="episodes that both hold out")
 
 
-def compare_elsewhere(
-    rows: Sequence[Rival], rivals: Sequence[Rival], fps: float, protocol: Protocol
+def judge_with_elsewhere(
+    found: Sequence[Comparison], ours: Sequence[Rival], elsewhere: Sequence[Rival], fps: float, protocol: Protocol
 ) -> list[Comparison]:
-    """Each row from elsewhere against each rival: a family of its own, so that adding it changes no other verdict."""
-    found = []
-    for row in rows:
-        listed: list[tuple[str, str, str, Paired | str]] = []
+    """A table's comparisons with the rows from elsewhere in the same family, so that equal predictions get equal verdicts.
+
+    Each row from elsewhere is compared with the rivals that ours are compared with. Like any other row it makes the family
+    larger, and so the others' p after Holm.
+
+    Parameters
+    ----------
+    found : what `table_comparisons` says of ours.
+    """
+    if not elsewhere:
+        return list(found)
+    named = {one.address: one for one in ours}
+    metrics = {"first_step_mae": 0, "at_one_second_mae": round(fps)}
+    listed: list[tuple[str, str, str, Paired | str]] = []
+    for c in found:
+        comparable = c.word != "not comparable"
+        pair = compare_common(named[c.a], named[c.b], metrics[c.metric], protocol) if comparable else c.words
+        listed.append((c.a, c.b, c.metric, pair))
+    rivals = [named[address] for address in dict.fromkeys(c.b for c in found) if address in named]
+    for row in elsewhere:
         for rival in rivals:
-            metrics = {"first_step_mae": 0} if row.seen else horizons_in_common(row.errors, rival.errors, fps)
-            for metric, horizon in metrics.items():
+            reached = {"first_step_mae": 0} if row.seen else horizons_in_common(row.errors, rival.errors, fps)
+            for metric, horizon in reached.items():
                 listed.append((row.address, rival.address, metric, compare_common(row, rival, horizon, protocol)))
-        judged = judge(listed)
-        found += [replace(c, words=c.words + UNKNOWN) for c in judged] if row.seen is None else judged
-    return found
+    unknown = {row.address for row in elsewhere if row.seen is None}
+    return [replace(c, words=c.words + UNKNOWN) if c.a in unknown else c for c in judge(listed)]

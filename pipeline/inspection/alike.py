@@ -17,6 +17,9 @@ from pipeline.types import ACTION, STATE
 PROJECTIONS, ASKED, NEAR, MOST = 4, 8, 2e-3, 64
 """Numbers a frame is looked up by, frames asked of each episode, how near counts (in spans), and neighbours looked at."""
 
+BATCH = 4096
+"""Frames that are looked up at once; what is found for them takes a kilobyte a frame."""
+
 SAME, OVERLAP = 0.005, 0.6
 """Two stretches are the same recording when their columns differ by 0.5 % of their span on average (people who repeat a
 task are never that exact), over at least 60 % of the shorter episode."""
@@ -52,18 +55,21 @@ def _candidates(survey: Survey) -> Counter:
         return Counter()
     asked = _asked(survey, points)
     tree = cKDTree(points, balanced_tree=False)
-    distances, found = tree.query(points[asked], k=min(MOST, len(points)), distance_upper_bound=NEAR)
-    starts = survey.starts
     met: Counter = Counter()
-    mine = np.searchsorted(starts, asked, side="right") - 1
-    for row, frame in enumerate(asked):
-        near = found[row][np.isfinite(distances[row])]
-        theirs = np.searchsorted(starts, near, side="right") - 1
-        shifts = (near - starts[theirs]) - (frame - starts[mine[row]])
-        met.update(
-            {_pair(mine[row], other, shift) for other, shift in zip(theirs, shifts, strict=True) if other != mine[row]}
-        )
+    for first in range(0, len(asked), BATCH):
+        frames = asked[first : first + BATCH]
+        distances, found = tree.query(points[frames], k=min(MOST, len(points)), distance_upper_bound=NEAR)
+        for frame, near in zip(frames, np.where(np.isfinite(distances), found, -1), strict=True):
+            met.update(_meetings(survey.starts, int(frame), near[near >= 0]))
     return Counter({pair: count for pair, count in met.items() if count >= ASKED // 4})
+
+
+def _meetings(starts: np.ndarray, frame: int, near: np.ndarray) -> set[tuple[int, int, int]]:
+    """The frame's episode, every other one that has a frame near it, and by how much that is shifted."""
+    mine = int(np.searchsorted(starts, frame, side="right")) - 1
+    theirs = np.searchsorted(starts, near, side="right") - 1
+    shifts = (near - starts[theirs]) - (frame - starts[mine])
+    return {_pair(mine, other, shift) for other, shift in zip(theirs, shifts, strict=True) if other != mine}
 
 
 def _pair(one: int, other: int, shift: int) -> tuple[int, int, int]:
@@ -72,13 +78,13 @@ def _pair(one: int, other: int, shift: int) -> tuple[int, int, int]:
 
 
 def _points(survey: Survey) -> np.ndarray | None:
-    """[N, PROJECTIONS] float32."""
+    """[N, PROJECTIONS]; float64, because a tree copies anything else."""
     scales = {feature: _scales(survey, feature) for feature in (ACTION, STATE)}
     living = [(f, int(i)) for f in (ACTION, STATE) for i in np.flatnonzero(scales[f])]
     if not living:
         return None
     weights = np.random.default_rng(0).normal(size=(len(living), PROJECTIONS)) / np.sqrt(len(living))
-    points = np.zeros((survey.demos.frames, PROJECTIONS), np.float32)
+    points = np.zeros((survey.demos.frames, PROJECTIONS))
     for (feature, i), weight in zip(living, weights, strict=True):
         scaled = survey.demos.columns[feature][:, i] / np.float32(scales[feature][i])
         for number in range(PROJECTIONS):

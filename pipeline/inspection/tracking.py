@@ -5,7 +5,7 @@ and offsets do not matter), between the neighbouring frames by a parabola.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,7 @@ WORSE, DEVIATIONS = 3.0, 8.0
 class Following:
     """How one joint follows its command: over all episodes, and in each [E].
 
+    column  the command, without its values
     lag   frames; NaN where it does not follow       correlation  at that lag
     gap   [E] mean |a − s| of a position command, in its unit; NaN for others
     """
@@ -73,7 +74,7 @@ def _follow(survey: Survey, command: Column, state: Column) -> Following:
     if command.kind == "position" and not command.circular:
         gap = per_episode(np.abs(command.values - state.values), survey.starts) / survey.demos.lengths
     return Following(
-        command, float(whole[0]) if correlation[0] >= DOES_NOT else float("nan"), float(correlation[0]),
+        replace(command, values=command.values[:0]), float(whole[0]) if correlation[0] >= DOES_NOT else float("nan"), float(correlation[0]),
         np.where(moves, own, np.nan), np.where(moves, correlations, np.nan), gap,
     )  # fmt: skip
 
@@ -83,7 +84,8 @@ def _correlate(survey: Survey, told: np.ndarray, done: np.ndarray) -> tuple[np.n
     late = int(min(LONGEST, survey.frames(LATE_S, least=3), survey.demos.lengths.max()))
     lags = np.arange(-EARLY, late + 1)
     table = np.empty((len(lags), survey.demos.episodes))
-    left = np.repeat(survey.starts[1:], survey.demos.lengths) - np.arange(survey.demos.frames)  # frames to the end
+    frames = np.arange(survey.demos.frames, dtype=np.int32)
+    left = np.repeat(survey.starts[1:].astype(np.int32), survey.demos.lengths) - frames  # to the end of the episode
     for row, lag in enumerate(lags):
         one, other = (told, done) if lag >= 0 else (done, told)
         shift = abs(int(lag))

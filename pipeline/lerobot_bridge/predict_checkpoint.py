@@ -208,7 +208,7 @@ def match_features(checkpoint: Checkpoint, data: DataFolder, chosen: dict, copie
             raise Refusal(
                 f"The checkpoint needs {column}, and the data set has none: it has {', '.join(data.features)}."
                 + (f" Did you mean {close[0]}?" if close else "")
-                + f" To feed it another column, say {name}=COLUMN."
+                + f" To show it another one, say --lerobot-feature {name}=COLUMN."
             )
         # SmolVLA resizes what it gets.
         if data.shape(column) != tuple(feature.shape) and not (checkpoint.kind == "smolvla" and data.is_camera(column)):

@@ -4,12 +4,14 @@ What belongs here: the distrust of an archive's names and sizes. What does not: 
 """
 
 import hashlib
+import lzma
 import os
 import shutil
 import stat
 import tempfile
 import zipfile
-from pathlib import Path, PurePosixPath
+import zlib
+from pathlib import Path, PureWindowsPath
 
 from pipeline.errors import DatasetError
 
@@ -34,21 +36,38 @@ def unpacked(path: Path) -> Path:
     Raises:
         DatasetError: it is no zip or damaged, holds no data set or a name that leads out of it, or unpacks to too much.
     """
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    kept = cache_folder() / digest[:32]
+    kept = cache_folder() / _digest(path)[:32]
     if not kept.exists():
         try:
             _unpack(path, kept)
-        except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
-            raise DatasetError(f"{path} cannot be read as a zip ({error}). Copy or download it again.") from None
+        except (zipfile.BadZipFile, EOFError, RuntimeError, ValueError, zlib.error, lzma.LZMAError) as error:
+            raise _damaged(path, error) from None
         except OSError as error:
+            if error.errno is None:  # what bz2 says of a damaged stream
+                raise _damaged(path, error) from None
             raise DatasetError(
                 f"{path} cannot be unpacked into {kept.parent}: {error.strerror or error}. Make room, or set XDG_CACHE_HOME to "
                 "another folder."
             ) from None
-    inner = [kept, *(child for child in sorted(kept.iterdir()) if child.is_dir())]
-    found = [folder for folder in inner if (folder / INFO).exists()]
+    return _home(path, kept)
+
+
+def _damaged(path: Path, error: Exception) -> DatasetError:
+    return DatasetError(f"{path} cannot be read as a zip ({error}). Copy or download it again.")
+
+
+def _digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read: {error.strerror or error}.") from None
+
+
+def _home(path: Path, folder: Path) -> Path:
+    """Where the one data set is in the unpacked archive."""
+    inner = [folder, *(child for child in sorted(folder.iterdir()) if child.is_dir())]
+    found = [place for place in inner if (place / INFO).exists()]
     if len(found) != 1:
         what = "no" if not found else f"{len(found)} folders with"
         raise DatasetError(
@@ -59,7 +78,7 @@ def unpacked(path: Path) -> Path:
 
 
 def _unpack(path: Path, kept: Path) -> None:
-    """Into a folder beside `kept`, then renamed."""
+    """Into a folder beside `kept`, which is renamed once it is seen to hold a data set."""
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         _check(path, members)
@@ -69,6 +88,7 @@ def _unpack(path: Path, kept: Path) -> None:
         try:
             for member in members:
                 archive.extract(member, draft)  # reads no more than the size that was checked, and compares the CRC
+            _home(path, draft)
             if not kept.exists():
                 draft.rename(kept)
         finally:
@@ -78,14 +98,9 @@ def _unpack(path: Path, kept: Path) -> None:
 def _check(path: Path, members: list[zipfile.ZipInfo]) -> None:
     """Names stay inside, are files or folders, and do not unpack to more than an honest archive does."""
     for member in members:
-        name = PurePosixPath(member.filename.replace("\\", "/"))
+        name = PureWindowsPath(member.filename)  # both kinds of slash divide it
         kind = stat.S_IFMT(member.external_attr >> 16)
-        if (
-            name.is_absolute()
-            or ".." in name.parts
-            or ":" in member.filename
-            or kind not in (0, stat.S_IFREG, stat.S_IFDIR)
-        ):
+        if name.anchor or ".." in name.parts or kind not in (0, stat.S_IFREG, stat.S_IFDIR):
             raise DatasetError(
                 f"{path} holds '{member.filename}', which leads out of the archive or is no plain file, so nothing of it was "
                 "unpacked. Pack the data set's folder again, without links."

@@ -41,6 +41,20 @@ def batches(parquet: "pq.ParquetFile", path: Path, columns: list[str], width: in
         raise DatasetError(f"{path} {damage(error)}") from None
 
 
+def check_type(kind: "pa.DataType") -> None:
+    """What can be known of a column before it is decoded: a few kilobytes of one long word repeated can stand for gigabytes.
+
+    Raises:
+        NotNumbers: it holds something that is no number.
+    """
+    import pyarrow as pa
+
+    while (inner := _inside(kind)) is not None:
+        kind = inner
+    if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)):
+        raise NotNumbers(f"values of type {kind}")
+
+
 def as_numbers(values: "pa.Array") -> np.ndarray:
     """[rows, width]; a missing number is NaN. `values` has at least one row.
 
@@ -49,6 +63,7 @@ def as_numbers(values: "pa.Array") -> np.ndarray:
     """
     import pyarrow as pa
 
+    check_type(values.type)
     rows = len(values)
     if isinstance(values, pa.ExtensionArray):
         values = values.storage
@@ -62,11 +77,18 @@ def as_numbers(values: "pa.Array") -> np.ndarray:
         values = values.flatten()
     if pa.types.is_dictionary(values.type):
         values = values.dictionary_decode()
-    if not (pa.types.is_floating(values.type) or pa.types.is_integer(values.type) or pa.types.is_boolean(values.type)):
-        raise NotNumbers(f"values of type {values.type}")
     if pa.types.is_boolean(values.type):
         values = values.cast(pa.uint8())
     return values.to_numpy(zero_copy_only=False).reshape(rows, -1)
+
+
+def _inside(kind: "pa.DataType") -> "pa.DataType | None":
+    """The type of what a list, a dictionary or an extension holds; None for anything else."""
+    import pyarrow as pa
+
+    if isinstance(kind, pa.BaseExtensionType):
+        return kind.storage_type
+    return kind.value_type if _is_list(kind) or pa.types.is_dictionary(kind) else None
 
 
 def _is_list(kind: "pa.DataType") -> bool:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import DatasetError
-from pipeline.lerobot_format.arrays import VALUES_AT_A_TIME, NotNumbers, as_numbers, batches
+from pipeline.lerobot_format.arrays import VALUES_AT_A_TIME, NotNumbers, as_numbers, batches, check_type
 from pipeline.lerobot_format.files import open_parquet
 from pipeline.lerobot_format.layout import Layout
 
@@ -107,7 +107,8 @@ def _survey(layout: Layout) -> _Survey:
         with open_parquet(layout.folder, file) as parquet:
             names = parquet.schema_arrow.names
             _check_columns(layout, file, names)
-            _check_widths(layout, file, parquet.metadata)
+            _check_types(layout, file, parquet.schema_arrow)
+            _check_widths(layout, file, names, parquet.metadata)
             rows.append(parquet.metadata.num_rows)
         shared = set(names) if shared is None else shared & set(names)
         somewhere |= set(names)
@@ -131,14 +132,32 @@ def _check_columns(layout: Layout, file: str, names: list[str]) -> None:
         raise DatasetError(f"{layout.folder / file} has the column '{twice}' twice. Remove one of the two.")
 
 
-def _check_widths(layout: Layout, file: str, metadata: "pq.FileMetaData") -> None:
+def _check_types(layout: Layout, file: str, schema: "pa.Schema") -> None:
+    widths = _widths(layout) | dict.fromkeys(_INDEX, 1)
+    for field in schema:
+        if field.name in widths:
+            try:
+                check_type(field.type)
+            except NotNumbers as error:
+                raise _wrong(layout, file, field.name, widths[field.name], str(error)) from None
+
+
+def _widths(layout: Layout) -> dict[str, int]:
+    return {key: len(feature.names) for key, feature in layout.features.items()}
+
+
+def _check_widths(layout: Layout, file: str, names: list[str], metadata: "pq.FileMetaData") -> None:
     """A few kilobytes of repeated values can stand for gigabytes, so columns wider than declared are never decoded."""
     held: Counter[str] = Counter()
     for number in range(metadata.num_row_groups):
         group = metadata.row_group(number)
         for column in (group.column(position) for position in range(group.num_columns)):
-            held[column.path_in_schema.split(".list.")[0]] += column.num_values
-    for key, width in {key: len(feature.names) for key, feature in layout.features.items()}.items():
+            held[column.path_in_schema] += column.num_values
+    for path in list(held):  # a list's path goes on after its name, as its writer pleased: .list.element, .list.item, .array
+        owner = max((name for name in names if path.startswith(f"{name}.")), key=len, default=None)
+        if owner is not None and path not in names:
+            held[owner] += held[path]
+    for key, width in _widths(layout).items():
         if held[key] > metadata.num_rows * width:
             raise _wrong(layout, file, key, width, f"{held[key] / metadata.num_rows:g} a frame")
 

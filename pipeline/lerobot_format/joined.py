@@ -4,14 +4,14 @@ The file has the columns `episode_index` (as recorded), `frame_index` (in the ep
 lists of one length. What does not belong here: the data set's own files (frames.py).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import ConfigError, DatasetError
-from pipeline.lerobot_format.arrays import NotNumbers, as_numbers, batches
+from pipeline.lerobot_format.arrays import NotNumbers, as_numbers, batches, check_type
 from pipeline.lerobot_format.files import open_outside
 from pipeline.lerobot_format.layout import INDEX_COLUMNS, MAX_WIDTH
 from pipeline.types import ACTION, STATE, Feature
@@ -41,8 +41,8 @@ def stamp_of_features(files: Mapping[str, Path]) -> dict[str, Any]:
     return stamps
 
 
-def check_names(names: Mapping[str, Path], recorded: Mapping[str, Any]) -> None:
-    """A joined feature has a name of its own.
+def check_names(names: Collection[str], recorded: Collection[str]) -> None:
+    """A joined feature has a name of its own, which no recorded feature and no camera has.
 
     Raises:
         ConfigError: the data set has a feature of that name.
@@ -71,12 +71,15 @@ def join_feature(
         values, seen = None, np.zeros(frames, np.int32)
         for batch in batches(parquet, path, [*KEYS, key], _width(parquet, key)):
             block = _values(path, key, batch.column(key))
+            if not block.shape[1]:
+                raise _fault(path, f"'{key}' has empty lists")
             if values is None:
                 values = np.empty((frames, block.shape[1]), np.float32)
             if block.shape[1] != values.shape[1]:
                 raise _fault(path, f"'{key}' has {values.shape[1]} and {block.shape[1]} numbers a frame")
             rows, frame = _frames_of(path, batch, ids, starts, excluded)
-            values[frame] = block[rows]
+            with np.errstate(over="ignore"):  # what comes out is checked for being finite
+                values[frame] = block[rows]
             np.add.at(seen, frame, 1)
     _check_complete(path, seen, ids, starts)
     _check_finite(path, key, values, ids, starts)
@@ -89,6 +92,7 @@ def _value_column(path: Path, parquet: "pq.ParquetFile") -> str:
     others = [name for name in names if name not in KEYS and name != "__index_level_0__"]
     if len(others) != 1 or any(names.count(key) != 1 for key in KEYS):
         raise _fault(path, f"it has the columns {', '.join(names)}")
+    _numbers_only(path, others[0], lambda: check_type(parquet.schema_arrow.field(others[0]).type))
     return others[0]
 
 
@@ -126,8 +130,12 @@ def _check_size(path: Path, parquet: "pq.ParquetFile", key: str, frames: int) ->
 
 
 def _values(path: Path, key: str, column: Any) -> np.ndarray:
+    return _numbers_only(path, key, lambda: as_numbers(column))
+
+
+def _numbers_only(path: Path, key: str, look: Callable[[], Any]) -> Any:
     try:
-        return as_numbers(column)
+        return look()
     except NotNumbers as error:
         raise _fault(path, f"'{key}' has {error}") from None
 

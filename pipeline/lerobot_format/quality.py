@@ -178,12 +178,12 @@ def dead_columns(demonstrations: Demonstrations, feature: str, frames: np.ndarra
     Where the unit is not known, 1 stands for its usual range, or the widest range of the feature's columns if that is
     less (small steps in metres must not count as dead).
     """
-    values = demonstrations.columns[feature][slice(None) if frames is None else frames].astype(np.float64)
+    values = demonstrations.columns[feature][slice(None) if frames is None else frames]
     if not len(values):
         return np.ones(values.shape[1], bool)
-    widest = float(np.ptp(values, axis=0).max())
+    widest = float((values.max(axis=0).astype(np.float64) - values.min(axis=0)).max())
     usual = np.array([usual_range(unit) or min(1.0, widest) for unit in demonstrations.features[feature].units])
-    deviation = values.std(axis=0)
+    deviation = np.array([column.astype(np.float64).std() for column in values.T])  # one at a time: memory
     return (deviation == 0) | (deviation < DEAD * usual)
 
 
@@ -268,8 +268,10 @@ def inspect_dataset(demonstrations: Demonstrations, semantics: Semantics) -> dic
 
 
 def _feature_summary(demonstrations: Demonstrations, semantics: Semantics, key: str) -> dict[str, Any]:
-    feature, values = demonstrations.features[key], demonstrations.columns[key].astype(np.float64)
-    numbers = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
+    feature, values = demonstrations.features[key], demonstrations.columns[key]
+    deviations = np.array([column.astype(np.float64).std() for column in values.T])  # one at a time: memory
+    means = values.mean(0, dtype=np.float64)
+    numbers = {"min": values.min(0), "max": values.max(0), "mean": means, "std": deviations}
     return {
         "key": key,
         "names": list(feature.names),

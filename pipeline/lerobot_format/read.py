@@ -50,7 +50,7 @@ def read_dataset(
         ConfigError: the choice names something that does not exist.
     """
     layout = read_layout(folder, choice)
-    check_names(choice.features, layout.features)
+    check_names(choice.features, {*layout.features, *(camera.key for camera in layout.cameras)})
     frames = read_frames(layout)
     places = place_frames(layout, frames)
     timestamps, clock_notes = _timestamps(layout, frames, places)

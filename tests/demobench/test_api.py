@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import demobench
@@ -100,3 +102,21 @@ def test_settings_of_the_data_set_count(place, monkeypatch):
     data = demobench.read("so101_pick_place_tape", observations=sets, kind="other", budget="quick")
     assert (data.experiment.steps, data.semantics.kinds) == (600, ("other", "other"))
     assert demobench.windows(data, [0], observations="moving").observations().values.shape[1] == 2
+
+
+def test_a_file_of_predictions_is_scored_and_compared_like_our_own(data, tmp_path):
+    """Hold-still's answers, sent as a file, are hold-still."""
+    still = demobench.predict(data, "hold_still")
+    episodes = data.demos.episode_of_frame[still.anchors]
+    rows = {
+        "episode_index": data.demos.episode_ids[episodes],
+        "frame_index": data.demos.frame_in_episode[still.anchors],
+        "action": still.actions[0, :, :4].tolist(),
+    }
+    pq.write_table(pa.table(rows), tmp_path / "mine.parquet")
+    (tmp_path / "trained.json").write_text(json.dumps([int(e) for e in demobench.split(data).folds[0].train]))
+    mine = demobench.score(data, tmp_path / "mine.parquet", trained_on=tmp_path / "trained.json")
+    assert (mine.address, mine.seen) == ("mine/elsewhere", False)
+    assert mine.metrics["first_step_mae"] == pytest.approx(demobench.score(data, still).metrics["first_step_mae"])
+    (found,) = demobench.compare(data, mine, still)
+    assert (found.word, found.words) == ("cannot tell", "the two predict the same")

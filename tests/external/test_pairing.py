@@ -11,10 +11,10 @@ from pipeline.external.pairing import (
     Rival,
     common_errors,
     compare_common,
-    compare_elsewhere,
+    judge_with_elsewhere,
     on_episodes,
 )
-from pipeline.statistics.comparisons import compare_errors, judge
+from pipeline.statistics.comparisons import compare_errors, judge, table_comparisons
 from pipeline.types import EpisodeErrors
 
 
@@ -72,25 +72,51 @@ def test_what_was_seen_in_training_is_not_compared():
     assert why == f"a/x was {SEEN}"
 
 
-def test_each_row_from_elsewhere_is_a_family_of_its_own():
-    still, champion = (
+def a_table(*elsewhere: Rival):
+    """Hold-still, a champion and another policy of ours, with rows from elsewhere."""
+    ours = [
         Rival("hold_still/s", errors_of(range(10), 3.0, 1), False),
         Rival("mlp/s", errors_of(range(10), 1.2), True),
+        Rival("other/s", errors_of(range(10), seed=4), True),
+    ]
+    rows = [(*one.address.split("/"), one.errors) for one in ours]
+    found = table_comparisons(rows, "mlp", 10.0, "strict")
+    return found, judge_with_elsewhere(found, ours, elsewhere, 10.0, "strict")
+
+
+def test_equal_predictions_get_equal_verdicts_in_one_family():
+    found, judged = a_table(Rival("sent/e", errors_of(range(10), seed=4), True))
+    of = {(c.a, c.b, c.metric): c for c in judged}
+    assert [(c.a, c.b, c.metric, c.p) for c in judged[: len(found)]] == [(c.a, c.b, c.metric, c.p) for c in found]
+    pairs = [key for key in of if key[0] == "sent/e"]
+    assert {(b, metric) for _, b, metric in pairs} == {(c.b, c.metric) for c in found if c.a == "other/s"}
+    for _, b, metric in pairs:
+        ours, sent = of["other/s", b, metric], of["sent/e", b, metric]
+        assert (sent.word, sent.p, sent.p_holm, sent.interval) == (ours.word, ours.p, ours.p_holm, ours.interval)
+    family = sum(c.p_holm is not None for c in judged)
+    assert min(c.p_holm for c in judged if c.p_holm) == pytest.approx(family * min(c.p for c in judged if c.p))
+
+
+def test_without_rows_from_elsewhere_nothing_changes():
+    found, judged = a_table()
+    assert judged == found
+
+
+def test_what_nobody_knows_is_said_and_what_was_seen_is_not_compared():
+    _, judged = a_table(Rival("u/e", errors_of(range(10)), True, None), Rival("s/e", errors_of(range(10)), True, True))
+    assert all(c.words.endswith(UNKNOWN) for c in judged if c.a == "u/e")
+    assert {(c.word, c.metric) for c in judged if c.a == "s/e"} == {("not comparable", "first_step_mae")}
+
+
+def test_a_champion_without_a_row_stays_without():
+    ours = [Rival("hold_still/s", errors_of(range(10), 3.0, 1), False)]
+    found = table_comparisons(
+        [("hold_still", "s", ours[0].errors), ("a", "s", errors_of(range(10)))], "gone", 10.0, "strict"
     )
-    good, unknown = (
-        Rival("good/e", errors_of(range(10), seed=4), True),
-        Rival("unknown/e", errors_of(range(10), seed=5), True, None),
-    )
-    alone = compare_elsewhere([good], [still, champion], 10.0, "strict")
-    both = compare_elsewhere([good, unknown], [still, champion], 10.0, "strict")
-    assert both[: len(alone)] == alone, "another row changes nothing"
-    assert {(c.b, c.metric) for c in alone} == {
-        (b, metric) for b in ("hold_still/s", "mlp/s") for metric in ("first_step_mae", "at_one_second_mae")
-    }
-    assert alone[0].word == "better"
-    assert all(c.words.endswith(UNKNOWN) for c in both[len(alone) :])
-    (seen,) = compare_elsewhere([Rival("seen/e", good.errors, True, True)], [still], 10.0, "strict")
-    assert (seen.word, seen.metric) == ("not comparable", "first_step_mae")
+    ours.append(Rival("a/s", errors_of(range(10)), True))
+    judged = judge_with_elsewhere(found, ours, [Rival("x/e", errors_of(range(5)), True)], 10.0, "strict")
+    assert {c.b for c in judged if c.a == "x/e"} == {"hold_still/s"}
+    assert [c.words for c in judged if c.b == "gone"] == ["the champion 'gone' has no up-to-date result here"]
 
 
 @pytest.mark.parametrize("episodes", [[], [2, 5]])

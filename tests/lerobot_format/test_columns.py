@@ -158,10 +158,6 @@ def test_units_of_all_columns_or_by_name(folder: Path):
     assert some.features[STATE].units == ("ticks", "N·m")
 
 
-def test_units_are_part_of_the_hash(folder: Path):
-    assert chosen(folder, units="deg").content_hash != chosen(folder).content_hash
-
-
 @pytest.mark.parametrize("unit", ["", "  ", "d" * 25, "de\ng", "\x1b[31m"])
 def test_a_unit_that_is_no_word(folder: Path, unit: str):
     with pytest.raises(ConfigError, match="expected a short word such as"):

@@ -171,7 +171,7 @@ def test_a_value_that_is_no_finite_number(refusal, value: float | None):
     [
         (pa.array([[1.0, 2.0]] * 8 + [[1.0]]), "'value' has lists of 1 to 2"),
         (pa.array([[1.0]] * 8 + [None]), "'value' has a frame without a value"),
-        (pa.array([[]] * 9, pa.list_(pa.float32())), "'value' has no numbers"),
+        (pa.array([[]] * 9, pa.list_(pa.float32())), "'value' has empty lists"),
         (pa.array(["a"] * 9), "'value' has values of type string"),
         (pa.array([{"x": 1.0}] * 9), "'value' has values of type struct"),
         (pa.array([[0.0] * 5000] * 9), "'value' has 5,000 numbers a frame"),
