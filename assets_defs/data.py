@@ -58,7 +58,8 @@ def demonstrations(
         save_demonstrations(demos, draft / "frames")
         picture_demonstration(demos, semantics, draft / "trajectories.png")
         stored = hash_again(draft / "frames")
-        meaning = [semantics.kinds, {k: list(v) for k, v in semantics.circular.items()}]
+        units = bench.experiment.dataset.units  # what names say is in the content; what the user says is not
+        meaning = [semantics.kinds, {k: list(v) for k, v in semantics.circular.items()}, *([units] if units else [])]
         shortest = int(demos.lengths.min())
         found = inspect(demos, semantics, local_folder(bench.experiment.dataset.source, workbench.config_dir))
         facts = inspect_dataset(demos, semantics) | found.as_json(bench.plan.key)

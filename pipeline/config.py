@@ -98,7 +98,7 @@ class DatasetConfig(Settings):
     champion: str | None = None
     floor_horizons: tuple[Annotated[int, Field(ge=0, le=10_000)], ...] | None = None
     state: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
-    action: str | None = None
+    action: str | Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     units: str | dict[str, str] | None = None
     features: dict[str, str] = {}
     exclude: tuple[Annotated[int, Field(ge=0)], ...] = ()
@@ -108,7 +108,8 @@ class DatasetConfig(Settings):
     def choice(self, config_dir: Path) -> ColumnChoice:
         """Which columns and episodes are used; the files of joined features are relative to `config_dir`."""
         files = {name: config_dir / Path(file).expanduser() for name, file in self.features.items()}
-        return ColumnChoice(self.state, self.action, self.units, files, tuple(sorted(set(self.exclude))))
+        action = (self.action,) if isinstance(self.action, str) else self.action
+        return ColumnChoice(self.state, action, self.units, files, tuple(sorted(set(self.exclude))))
 
 
 class PolicyConfig(Settings):

@@ -397,10 +397,12 @@ def select_rows(rows: Iterable[Mapping[str, Any]], target: Target) -> list[Mappi
         row
         for row in rows
         if row["method"] == EXTERNAL
-        or (row["policy"] in names
-        and (
-            not target.observations
-            or row["observations"] in target.observations
-            or not METHODS[row["method"]].uses_observations
-        ))
+        or (
+            row["policy"] in names
+            and (
+                not target.observations
+                or row["observations"] in target.observations
+                or not METHODS[row["method"]].uses_observations
+            )
+        )
     ]

@@ -50,14 +50,14 @@ class ColumnChoice:
     """What a user says about the columns and episodes of a data set; the default leaves them as they are recorded.
 
     state     features that, side by side, are the state; None: `observation.state`, else what is plainly meant
-    action    the feature that is the action; None: `action`, else what is plainly meant
+    action    features that, side by side, are the action; None: `action`, else what is plainly meant
     units     of the columns of action and state: one for all of them, or by column name
     features  name → a parquet file with one value a frame, joined as a feature of that name
     exclude   recorded `episode_index` of episodes that are left out, ascending
     """
 
     state: tuple[str, ...] | None = None
-    action: str | None = None
+    action: tuple[str, ...] | None = None
     units: str | Mapping[str, str] | None = None
     features: Mapping[str, Path] = field(default_factory=dict)
     exclude: tuple[int, ...] = ()

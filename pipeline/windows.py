@@ -197,6 +197,11 @@ def check_features(demos: Demonstrations, observation_set: ObservationSet) -> No
         ConfigError: it is not ("did you mean").
     """
     for key in observation_set.features:
+        if key == ACTION:
+            raise ConfigError(
+                f"The observation set '{observation_set.name}' names '{ACTION}': a policy would see what it is to predict. "
+                "Leave it out."
+            )
         if key not in demos.columns:
             known = [name for name in demos.columns if name != ACTION]
             raise ConfigError(

@@ -49,20 +49,25 @@ def show_inspection(facts: Mapping[str, Any], console: Console, said_by_checks: 
     console.print(_columns(facts))
     for camera in facts["cameras"]:
         there = "there" if camera["present"] else "declared, but its files are absent"
-        console.print(f"camera {escape(camera['key'])} {camera['width']}×{camera['height']}: {there}", soft_wrap=True)
+        console.print(f"camera {plain(camera['key'])} {camera['width']}×{camera['height']}: {there}", soft_wrap=True)
     for warning in facts["warnings"]:
         if warning not in said_by_checks:
-            console.print(f"[yellow]note:[/] {escape(warning)}", soft_wrap=True)
+            console.print(f"[yellow]note:[/] {plain(warning)}", soft_wrap=True)
     console.print()
     _show_findings(facts["findings"], facts["skipped"], console)
     _show_episodes(facts, console)
 
 
+def plain(words: str) -> str:
+    """What others wrote, to be printed as it is: no markup, and no characters that a terminal obeys."""
+    return escape("".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in words))
+
+
 def _show_facts(facts: Mapping[str, Any], console: Console) -> None:
     lengths, fps = facts["episode_length"], facts["fps"]
-    console.print(f"[bold]{escape(facts['name'])}[/]  {escape(facts['source'])}", soft_wrap=True)
+    console.print(f"[bold]{plain(facts['name'])}[/]  {plain(facts['source'])}", soft_wrap=True)
     revision = f" · revision {facts['revision'][:12]}" if facts["revision"] else ""
-    robot = f" · {escape(facts['robot_type'])}" if facts["robot_type"] else ""
+    robot = f" · {plain(facts['robot_type'])}" if facts["robot_type"] else ""
     console.print(
         f"{facts['episodes']:,} episodes · {facts['frames']:,} frames · {fps:g} fps · {facts['frames'] / fps / 60:.1f} minutes · "
         f"{lengths['min']} to {lengths['max']} frames an episode (median {lengths['median']:g}){robot}{revision}",
@@ -74,7 +79,7 @@ def _show_facts(facts: Mapping[str, Any], console: Console) -> None:
         )
     tasks = [(words, count) for words, count in facts["tasks"].items() if words]
     for words, count in tasks[:SHOWN]:
-        console.print(f"task “{escape(words)}”: {count} episode{'s' * (count != 1)}", soft_wrap=True)
+        console.print(f"task “{plain(words)}”: {count} episode{'s' * (count != 1)}", soft_wrap=True)
     if len(tasks) > SHOWN:
         console.print(f"… and {len(tasks) - SHOWN} more tasks", soft_wrap=True)
     console.print(f"[dim]content hash {facts['content_hash']}[/]\n", soft_wrap=True)
@@ -84,7 +89,7 @@ def _columns(facts: Mapping[str, Any]) -> Table:
     """A row a column; what only action columns have is empty for the others."""
     table = Table("column", "unit", "kind", "tracking lag", "mean |a − s|", "range", title_justify="left")
     for feature in sorted(facts["features"], key=lambda feature: feature["key"] != "action"):
-        table.add_row(f"[bold]{escape(feature['key'])}[/]")
+        table.add_row(f"[bold]{plain(feature['key'])}[/]")
         if len(feature["names"]) > WIDE:
             table.add_row(f"  {len(feature['names'])} columns", "", "", "", "", _wide_range(feature))
             continue
@@ -106,7 +111,7 @@ def _row(facts: Mapping[str, Any], feature: Mapping[str, Any], position: int) ->
         kind += " angle"
     unit = feature["units"][position] or "?"
     values = f"{_number(feature['min'][position])} … {_number(feature['max'][position])}"
-    return f"  {escape(feature['names'][position])}", escape(unit), kind.strip(), lag, gap, values
+    return f"  {plain(feature['names'][position])}", plain(unit), kind.strip(), lag, gap, values
 
 
 def _number(value: float | None) -> str:
@@ -121,7 +126,7 @@ def _wide_range(feature: Mapping[str, Any]) -> str:
 def _show_findings(findings: Sequence[Mapping[str, Any]], skipped: Mapping[str, str], console: Console) -> None:
     found = {finding["check"] for finding in findings}
     quiet = ", ".join(check for check in CHECKS if check not in found and check not in skipped)
-    left = "".join(f" Not looked at: {check} ({escape(why)})." for check, why in skipped.items())
+    left = "".join(f" Not looked at: {check} ({plain(why)})." for check, why in skipped.items())
     if not findings:
         console.print(f"[green]Nothing looks wrong.[/] Looked at: {quiet}.{left}", soft_wrap=True)
         return
@@ -131,7 +136,7 @@ def _show_findings(findings: Sequence[Mapping[str, Any]], skipped: Mapping[str, 
         console.print(f"[yellow]{check}[/]")
         for finding in mine[:SHOWN]:
             where = "" if finding["episode"] is None else f"episode {finding['episode']}: "
-            console.print(f"  {where}{escape(finding['words'])}", soft_wrap=True)
+            console.print(f"  {where}{plain(finding['words'])}", soft_wrap=True)
         if len(mine) > SHOWN:
             console.print(f"  … and {len(mine) - SHOWN} more; --json lists them all", soft_wrap=True)
     console.print()
@@ -141,9 +146,9 @@ def _show_episodes(facts: Mapping[str, Any], console: Console) -> None:
     if facts["look_at"]:
         console.print("[bold]Look at these episodes first[/]")
         for place, one in enumerate(facts["look_at"], 1):
-            console.print(f"  {place}. {escape(one['command'])}", soft_wrap=True)
+            console.print(f"  {place}. {plain(one['command'])}", soft_wrap=True)
             for reason in one["reasons"]:
-                console.print(f"     {escape(reason)}", soft_wrap=True)
+                console.print(f"     {plain(reason)}", soft_wrap=True)
     elif facts["findings"]:
         console.print("No single episode stands out.")
     if facts["exclude_line"]:
@@ -151,4 +156,4 @@ def _show_episodes(facts: Mapping[str, Any], console: Console) -> None:
             "\n[bold]Worth leaving out[/], once you have looked: put this under the data set in demobench.toml",
             soft_wrap=True,
         )
-        console.print(f"  {escape(facts['exclude_line'])}", soft_wrap=True)
+        console.print(f"  {plain(facts['exclude_line'])}", soft_wrap=True)

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.lerobot_format.kinds import wrap
+from pipeline.lerobot_format.kinds import state_column, steps_of, wrap
 from pipeline.lerobot_format.quality import dead_columns
 from pipeline.types import ACTION, STATE, Demonstrations, Semantics
 
@@ -94,12 +94,23 @@ class Survey:
             for key in (ACTION, STATE)
         }
 
+    @cached_property
+    def partners(self) -> tuple[int | None, ...]:
+        """[A] the state column that each action column commands; of steps, which `Semantics` leaves out, by name or place."""
+        steps = steps_of(self.demos) if "delta" in self.semantics.kinds else None
+        return tuple(
+            state_column(self.demos, position, steps) if kind == "delta" and steps and known is None else known
+            for position, (kind, known) in enumerate(
+                zip(self.semantics.kinds, self.semantics.state_column, strict=True)
+            )
+        )
+
     def column(self, feature: str, position: int) -> Column:
         demos, of_action = self.demos, feature == ACTION
         return Column(
             feature, position, demos.features[feature].names[position], demos.features[feature].units[position],
             self.semantics.kinds[position] if of_action else None,
-            self.semantics.state_column[position] if of_action else None,
+            self.partners[position] if of_action else None,
             self.semantics.circular[feature][position],
             np.ascontiguousarray(demos.columns[feature][:, position], np.float32), float(self.spans[feature][position]),
         )  # fmt: skip

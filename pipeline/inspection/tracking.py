@@ -74,7 +74,8 @@ def _follow(survey: Survey, command: Column, state: Column) -> Following:
     if command.kind == "position" and not command.circular:
         gap = per_episode(np.abs(command.values - state.values), survey.starts) / survey.demos.lengths
     return Following(
-        replace(command, values=command.values[:0]), float(whole[0]) if correlation[0] >= DOES_NOT else float("nan"), float(correlation[0]),
+        replace(command, values=command.values[:0]),
+        float(whole[0]) if correlation[0] >= DOES_NOT else float("nan"), float(correlation[0]),
         np.where(moves, own, np.nan), np.where(moves, correlations, np.nan), gap,
     )  # fmt: skip
 

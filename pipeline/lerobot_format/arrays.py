@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-VALUES_AT_A_TIME = 2**21
-"""Single values that are decoded at once: 16 MB as int64, whatever the file's row groups are."""
+VALUES_AT_A_TIME = 2**19
+"""Single values that are decoded at once: 4 MB as int64, whatever the file's row groups are."""
 
 
 class NotNumbers(ValueError):

@@ -23,20 +23,21 @@ STATES = (
 )  # fmt: skip
 """Names under which public data sets keep what LeRobot's convention calls `action` and `observation.state`."""
 SPLIT_STATES = (f"{STATE}.", "observation.states.", "state.", "states.")
-"""Beginnings of the names of a state that is kept in parts."""
+SPLIT_ACTIONS = ("action.", "actions.")
+"""Beginnings of the names of a state, and of an action, that is kept in parts."""
 
 
 @dataclass(frozen=True)
 class Roles:
-    """The features that are the state, side by side, and the one that is the action; `notes` on what was guessed."""
+    """The features that, side by side, are the state and the action; `notes` on what was guessed."""
 
     state: tuple[str, ...]
-    action: str
+    action: tuple[str, ...]
     notes: tuple[str, ...]
 
     @property
     def needed(self) -> tuple[str, ...]:
-        return (self.action, *self.state)
+        return (*self.action, *self.state)
 
 
 def choose_roles(known: Sequence[str], choice: ColumnChoice, where: str) -> Roles:
@@ -48,23 +49,38 @@ def choose_roles(known: Sequence[str], choice: ColumnChoice, where: str) -> Role
     """
     notes = []
     if choice.action is not None:
-        action = _existing(choice.action, "action", known, where)
+        action = _set("action", choice.action, known, where)
     elif ACTION in known:
-        action = ACTION
+        action = (ACTION,)
     else:
-        action = _the_only(_action_candidates(known), known, ACTION, f'action = "{(known or ["…"])[0]}"', where)[0]
-        notes.append(f"There is no feature '{ACTION}'; '{action}' was taken. Set `action` to be sure.")
+        action = _guessed("action", ACTION, _candidates(known, ACTIONS, SPLIT_ACTIONS), known, where, notes)
     if choice.state is not None:
-        state = tuple(_existing(name, "state", known, where) for name in choice.state)
-        _check_state(state, action)
+        state = _set("state", choice.state, known, where)
     elif STATE in known:
         state = (STATE,)
     else:
-        others = [name for name in known if name != action]
-        state = _the_only(_state_candidates(others), known, STATE, f'state = ["{(others or ["…"])[0]}"]', where)
-        listed = ", ".join(state)
-        notes.append(f"There is no feature '{STATE}'; it was made of: {listed}. Set `state` to be sure.")
+        others = [name for name in known if name not in action]
+        state = _guessed("state", STATE, _candidates(others, STATES, SPLIT_STATES), others, where, notes)
+    for name in state:
+        if name in action:
+            raise ConfigError(f"state names '{name}', which is the action: a policy would see what it is to predict.")
     return Roles(state, action, tuple(notes))
+
+
+def _set(key: str, names: tuple[str, ...], known: Sequence[str], where: str) -> tuple[str, ...]:
+    """The features that the user named."""
+    if len(set(names)) < len(names):
+        raise ConfigError(f"{key} names a feature twice: {', '.join(names)}. Name each once.")
+    return tuple(_existing(name, key, known, where) for name in names)
+
+
+def _guessed(
+    key: str, usual: str, candidates: list[tuple[str, ...]], known: Sequence[str], where: str, notes: list[str]
+) -> tuple[str, ...]:
+    """What is plainly meant, with a note that says so."""
+    found = _the_only(candidates, known, usual, f'{key} = ["{(known or ["…"])[0]}"]', where)
+    notes.append(f"There is no feature '{usual}'; it was made of: {', '.join(found)}. Set `{key}` to be sure.")
+    return found
 
 
 def _existing(name: str, key: str, known: Sequence[str], where: str) -> str:
@@ -73,13 +89,6 @@ def _existing(name: str, key: str, known: Sequence[str], where: str) -> str:
             f"{key} names the feature '{name}', which {where} does not have as numbers. {did_you_mean(name, known)}"
         )
     return name
-
-
-def _check_state(state: tuple[str, ...], action: str) -> None:
-    if action in state:
-        raise ConfigError(f"state names '{action}', which is the action: a policy would see what it is to predict.")
-    if len(set(state)) < len(state):
-        raise ConfigError(f"state names a feature twice: {', '.join(state)}. Name each once.")
 
 
 def _the_only(
@@ -96,14 +105,10 @@ def _the_only(
     )
 
 
-def _action_candidates(known: Sequence[str]) -> list[tuple[str, ...]]:
-    parts = [name for name in known if name.startswith(("action.", "actions.")) and name not in ACTIONS]
-    return [(name,) for name in known if name in ACTIONS or parts == [name]]
-
-
-def _state_candidates(known: Sequence[str]) -> list[tuple[str, ...]]:
-    split = [tuple(name for name in known if name.startswith(start)) for start in SPLIT_STATES]
-    return [group for group in split if group] + [(name,) for name in known if name in STATES]
+def _candidates(known: Sequence[str], names: Sequence[str], beginnings: Sequence[str]) -> list[tuple[str, ...]]:
+    """Features kept in parts, and single ones, under the names of public data sets."""
+    parts = [tuple(n for n in known if n.startswith(start) and n not in names) for start in beginnings]
+    return [group for group in parts if group] + [(name,) for name in known if name in names]
 
 
 def arrange(
@@ -112,19 +117,20 @@ def arrange(
     """`columns` and `features` with `action` and `observation.state` in them.
 
     One feature in a role takes its name. Of several that are the state, side by side, each also stays what it was, so
-    that an observation set may name it. What had the name before and plays no part is left out.
+    that an observation set may name it; those of the action do not: a policy would see what it is to predict. What had
+    the name before and plays no part is left out.
     """
-    columns, features = dict(columns), dict(features)
-    parts = [(features[key], columns[key]) for key in roles.state]
-    action, values = features[roles.action], columns[roles.action]
-    for key in {ACTION, STATE, roles.action, *(roles.state if len(parts) == 1 else ())}:
-        columns.pop(key, None)
-        features.pop(key, None)
-    names = _side_by_side([feature for feature, _ in parts])
-    units = tuple(unit for feature, _ in parts for unit in feature.units)
-    stacked = parts[0][1] if len(parts) == 1 else np.concatenate([part for _, part in parts], axis=1)
-    first = {ACTION: values, STATE: stacked}
-    return first | columns, {ACTION: replace(action, key=ACTION), STATE: Feature(STATE, names, units)} | features
+    left, described = dict(columns), dict(features)
+    for key in {ACTION, STATE, *roles.action, *(roles.state if len(roles.state) == 1 else ())}:
+        left.pop(key, None)
+        described.pop(key, None)
+    first, about = {}, {}
+    for key, parts in ((ACTION, roles.action), (STATE, roles.state)):
+        values = [columns[part] for part in parts]
+        first[key] = values[0] if len(parts) == 1 else np.concatenate(values, axis=1)
+        units = tuple(unit for part in parts for unit in features[part].units)
+        about[key] = Feature(key, _side_by_side([features[part] for part in parts]), units)
+    return first | left, about | described
 
 
 def _side_by_side(parts: Sequence[Feature]) -> tuple[str, ...]:

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 MAX_TEXT_BYTES = 256 * 2**20
 """The largest JSON file that is read: a million episodes take about half of it."""
 
+READ_BYTES = 2**20
+"""Bytes of a parquet column that are read at once; else a whole row group's would be in memory beside the numbers."""
+
+_HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
 _SPEC = re.compile(r"(0?\d{1,2}d?)?")
 
 
@@ -82,7 +86,7 @@ def read_json(folder: Path, relative: str) -> Any:
     """One JSON document of the data set."""
     text = _read_text(folder, relative)
     try:
-        return json.loads(text)
+        return _parse(text)
     except (ValueError, RecursionError) as error:
         raise DatasetError(
             f"{folder / relative} is not JSON ({error}). The file is damaged: copy the data set again."
@@ -92,11 +96,11 @@ def read_json(folder: Path, relative: str) -> Any:
 def read_json_lines(folder: Path, relative: str) -> list[dict[str, Any]]:
     """The objects of a .jsonl file of the data set."""
     rows = []
-    for number, line in enumerate(_read_text(folder, relative).splitlines(), start=1):
+    for number, line in enumerate(_read_text(folder, relative).split("\n"), start=1):
         if not line.strip():
             continue
         try:
-            row = json.loads(line)
+            row = _parse(line)
         except (ValueError, RecursionError):
             row = None
         if not isinstance(row, dict):
@@ -106,6 +110,14 @@ def read_json_lines(folder: Path, relative: str) -> list[dict[str, Any]]:
             )
         rows.append(row)
     return rows
+
+
+def _parse(text: str) -> Any:
+    """JSON; half of a surrogate pair, which it can escape and nothing can write, becomes a question mark."""
+    value = json.loads(text)
+    if _HALF_PAIR.search(text):
+        value = json.loads(json.dumps(value, ensure_ascii=False).encode(errors="replace"))
+    return value
 
 
 def _read_text(folder: Path, relative: str) -> str:
@@ -137,7 +149,9 @@ def open_outside(path: Path) -> "pq.ParquetFile":
     import pyarrow.parquet as pq
 
     try:
-        return pq.ParquetFile(path)
+        return pq.ParquetFile(path, buffer_size=READ_BYTES, pre_buffer=False)
+    except FileNotFoundError:
+        raise DatasetError(f"There is no file {path}. Correct its path, or write the file.") from None
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(f"{path} {damage(error)}") from None
 

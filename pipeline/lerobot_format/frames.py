@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.errors import DatasetError
 from pipeline.lerobot_format.arrays import VALUES_AT_A_TIME, NotNumbers, as_numbers, batches, check_type
-from pipeline.lerobot_format.files import open_parquet
+from pipeline.lerobot_format.files import inside, open_parquet
 from pipeline.lerobot_format.layout import Layout
 
 if TYPE_CHECKING:
@@ -104,6 +104,7 @@ def _survey(layout: Layout) -> _Survey:
     shared: set[str] | None = None
     somewhere: set[str] = set()
     for file in layout.files:
+        _check_presence(layout, file)
         with open_parquet(layout.folder, file) as parquet:
             names = parquet.schema_arrow.names
             _check_columns(layout, file, names)
@@ -118,6 +119,17 @@ def _survey(layout: Layout) -> _Survey:
             where = "only in some data files" if key in somewhere else "in no data file"
             notes.append(f"Column '{key}' is {where}; it was {'derived' if key in _INDEX else 'left out'}.")
     return _Survey(rows, shared or set(), notes)
+
+
+def _check_presence(layout: Layout, file: str) -> None:
+    """Without a file nothing can be done but to leave its episodes out."""
+    if (path := inside(layout.folder, file)).exists():
+        return
+    lost = [str(entry.id) for entry in layout.episodes if entry.file == file]
+    out = f", or leave out what was in it: exclude = [{', '.join(lost)}]" if lost else ""
+    raise DatasetError(
+        f"{path} is missing, though the data set's own lists name it. Copy or download the data set again{out}."
+    )
 
 
 def _check_columns(layout: Layout, file: str, names: list[str]) -> None:
@@ -153,7 +165,8 @@ def _check_widths(layout: Layout, file: str, names: list[str], metadata: "pq.Fil
         group = metadata.row_group(number)
         for column in (group.column(position) for position in range(group.num_columns)):
             held[column.path_in_schema] += column.num_values
-    for path in list(held):  # a list's path goes on after its name, as its writer pleased: .list.element, .list.item, .array
+    # A list's path goes on after its name, as its writer pleased: .list.element, .list.item, .array.
+    for path in list(held):
         owner = max((name for name in names if path.startswith(f"{name}.")), key=len, default=None)
         if owner is not None and path not in names:
             held[owner] += held[path]

@@ -192,7 +192,7 @@ def _declared(info: _Info) -> dict[str, dict[str, Any]]:
         if not _has_dtype_and_shape(feature):
             raise DatasetError(
                 f"{info.path}: feature '{key}' needs a dtype and a shape of whole numbers above 0, "
-                f"got {str(feature)[:120]}. Correct it."
+                f"got {repr(feature)[:120]}. Correct it."
             )
     return features
 
@@ -218,7 +218,7 @@ def _features(
         if key in INDEX_COLUMNS or _is_picture(feature):
             continue
         if dtype not in _NUMBERS or width > MAX_WIDTH:
-            if key in (choice.action or ACTION, *(choice.state or (STATE,))):
+            if key in (*(choice.action or (ACTION,)), *(choice.state or (STATE,))):
                 raise DatasetError(
                     f"{info.path}: '{key}' is {dtype} {feature['shape']}; expected numbers, at most {MAX_WIDTH} a "
                     "frame. Correct meta/info.json, or record the feature as numbers."
@@ -292,7 +292,7 @@ def _without(listed: tuple[EpisodeEntry, ...], exclude: tuple[int, ...], folder:
         if number not in known:
             raise ConfigError(
                 f"exclude names the episode {number}, which {folder} does not have; its {len(known)} episodes are numbered "
-                f"{listed[0].id} to {listed[-1].id}. Take it from the list."
+                f"{listed[0].id} to {listed[-1].id}. Remove it from exclude."
             )
     left = tuple(entry for entry in listed if entry.id not in set(exclude))
     if not left:

@@ -66,10 +66,10 @@ def _owners(layout: Layout, frames: Frames) -> tuple[np.ndarray, list[str]]:
         if listed is None:
             raise _other_count(layout, frames)
         return listed, []
-    found = np.unique(frames.episode_id)
-    absent = [entry.id for entry in layout.episodes if entry.id not in set(found.tolist())]
+    found = set(np.unique(frames.episode_id).tolist())
+    absent = [entry.id for entry in layout.episodes if entry.id not in found]
     if not absent:
-        unlisted = sorted(set(found.tolist()) - {entry.id for entry in layout.listed})
+        unlisted = sorted(found - {entry.id for entry in layout.listed})
         rows = int(np.isin(frames.episode_id, unlisted).sum()) if unlisted else 0
         said = f"{rows:,} frames of episodes that meta/ does not list were left out: {_numbers(unlisted)}."
         return frames.episode_id, [said] if unlisted else []

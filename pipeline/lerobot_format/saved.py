@@ -16,6 +16,8 @@ from pipeline.errors import StoreError
 from pipeline.types import Camera, Demonstrations, Feature
 
 _META = "meta.json"
+ROWS_AT_A_TIME = 2**16
+"""Rows that are hashed at once: no column is copied whole."""
 
 
 def hash_demonstrations(
@@ -37,10 +39,12 @@ def hash_demonstrations(
     def add(label: Any, array: np.ndarray, kind: str) -> None:
         header = json.dumps([label, list(array.shape), kind], ensure_ascii=False, separators=(",", ":"))
         digest.update(len(header.encode()).to_bytes(8, "little") + header.encode())
-        digest.update(np.ascontiguousarray(array, dtype=kind).data)
+        for start in range(0, len(array), ROWS_AT_A_TIME):
+            part = array[start : start + ROWS_AT_A_TIME]
+            digest.update(np.ascontiguousarray(part + np.float32(0) if kind == "<f4" else part, dtype=kind).data)
 
     for key in sorted(columns):
-        add([key, *features[key].names], columns[key] + np.float32(0), "<f4")
+        add([key, *features[key].names], columns[key], "<f4")
     add("episode_starts", episode_starts, "<i8")
     add("episode_ids", episode_ids, "<i8")
     add("timestamps", timestamps, "<f8")

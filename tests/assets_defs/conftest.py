@@ -31,7 +31,8 @@ class TinyBenchmark:
 
     @property
     def config(self) -> Config:
-        return parse_config({**self.raw, "datasets": {"tiny": {"source": str(self.folder)}}}, "test")
+        said = self.raw.get("datasets", {}).get("tiny", {})
+        return parse_config({**self.raw, "datasets": {"tiny": {"source": str(self.folder), **said}}}, "test")
 
     def target(self, **choices) -> Target:
         return resolve_target("tiny", self.config, self.folder, Choices(**choices), self.store.experiments())

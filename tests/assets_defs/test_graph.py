@@ -100,6 +100,14 @@ def test_other_data_under_the_same_name_makes_everything_again(copy, tmp_path):
     assert all(copy.store.made(copy.plan().folder(u)).fingerprint != f for u, f in before.items())
 
 
+def test_units_of_the_users_own_reach_the_table(copy):
+    copy.raw["datasets"] = {"tiny": {"units": "degrees"}}
+    copy.run()
+    table = copy.plan().folder(Unit("benchmark_table")) / "table.json"
+    assert json.loads(table.read_text())["dataset"]["action_units"] == ["deg", "deg"]
+    assert copy.plan().stale() == {}
+
+
 def test_a_variant_never_overwrites(copy):
     before = {u: copy.store.made(copy.plan().folder(u)) for u in copy.plan().units()}
     assets, _ = copy.run(protocol="notebook", policies=("mlp",), chunks=(1,))

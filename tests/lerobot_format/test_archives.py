@@ -168,7 +168,9 @@ def test_no_room(refusal, archive: Path, monkeypatch: pytest.MonkeyPatch, cache:
 def test_a_cache_that_cannot_be_written(archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with pytest.raises(DatasetError, match="cannot be unpacked into .*: Not a directory. Make room, or set XDG_CACHE_HOME"):
+    with pytest.raises(
+        DatasetError, match="cannot be unpacked into .*: Not a directory. Make room, or set XDG_CACHE_HOME"
+    ):
         unpacked(archive)
 
 
@@ -203,7 +205,9 @@ def test_an_archive_with_a_password(refusal, archive: Path):
 
 def test_something_else_that_is_called_zip(refusal, tmp_path: Path):
     (tmp_path / "set.zip").write_text("not at all")
-    assert "cannot be read as a zip (File is not a zip file). Copy or download it again." in refusal(tmp_path / "set.zip")
+    assert "cannot be read as a zip (File is not a zip file). Copy or download it again." in refusal(
+        tmp_path / "set.zip"
+    )
 
 
 def test_a_file_and_a_folder_of_one_name(refusal, archive: Path):

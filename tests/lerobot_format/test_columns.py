@@ -2,6 +2,7 @@
 configuration file to the columns.
 """
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from pipeline.types import ACTION, STATE, ColumnChoice, Demonstrations, Feature
 from pipeline.windows import make_windows
 from tests.makers import Recording, edit_info, tiny_recording, write_v2, write_v3
 
+DOCS = Path(__file__).parents[2] / "docs/configuration.md"
 ARM, GRIPPER, FORCE, VELOCITY = (f"observation.{part}" for part in ("arm", "gripper", "force", "arm_velocity"))
 
 
@@ -78,7 +80,7 @@ def test_features_side_by_side_are_the_state(folder: Path):
 
 def test_one_feature_takes_the_name_of_its_part(folder: Path):
     made = several()
-    read = chosen(folder, state=(GRIPPER,), action=ARM)
+    read = chosen(folder, state=(GRIPPER,), action=(ARM,))
     np.testing.assert_array_equal(read.columns[STATE], made.features[GRIPPER][1])
     np.testing.assert_array_equal(read.columns[ACTION], made.features[ARM][1])
     assert read.features[ACTION].names == ("x", "y")
@@ -92,6 +94,14 @@ def test_the_recorded_state_may_be_a_part_of_the_state(folder: Path):
     read = chosen(folder, state=(STATE, GRIPPER))
     np.testing.assert_array_equal(read.columns[STATE], np.hstack([made.features[key][1] for key in (STATE, GRIPPER)]))
     assert read.features[STATE].names == ("joint_0", "joint_1", "gripper")
+
+
+def test_an_action_in_parts_is_one_and_nobody_sees_its_parts(folder: Path):
+    made = several()
+    read = chosen(folder, action=(GRIPPER, FORCE))
+    np.testing.assert_array_equal(read.columns[ACTION], np.hstack([made.features[key][1] for key in (GRIPPER, FORCE)]))
+    assert GRIPPER not in read.columns
+    assert FORCE not in read.features
 
 
 def test_names_that_clash_have_the_features_in_front():
@@ -171,10 +181,10 @@ def test_a_unit_that_is_no_word(folder: Path, unit: str):
     ("choice", "words"),
     [
         ({"state": ("observation.arms",)}, r"state names .*observation\.arms.*Did you mean 'observation\.arm'\?"),
-        ({"action": "actions"}, r"action names .*actions.*Did you mean 'action'\?"),
-        ({"action": "frame_index"}, "which .* does not have as numbers. Known: action, "),
+        ({"action": ("actions",)}, r"action names .*actions.*Did you mean 'action'\?"),
+        ({"action": ("frame_index",)}, "which .* does not have as numbers. Known: action, "),
         ({"state": (ARM, ACTION)}, "state names 'action', which is the action"),
-        ({"action": ARM, "state": (ARM,)}, "which is the action"),
+        ({"action": (ARM,), "state": (ARM,)}, "which is the action"),
         ({"state": (ARM, GRIPPER, ARM)}, "state names a feature twice"),
         ({"units": {"joint_7": "deg"}}, r"units names the column 'joint_7'.*Did you mean 'joint_[01]'\?"),
         ({"units": {"y": "m"}}, "units names the column 'y', which neither action nor observation.state has"),
@@ -322,6 +332,24 @@ def test_what_is_checked_before_any_work(place: Path):
     scores(place / "scores/score.parquet")
     with pytest.raises(ConfigError, match=r"Did you mean 'observation\.arm'"):
         check_experiment(experiment_of(place), place)
+
+
+def test_the_documented_example(tmp_path: Path):
+    example = re.search(r"```toml\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)[1]
+    (tmp_path / "demobench.toml").write_text(example)
+    joints = ("shoulder", "elbow", "gripper")
+    made = tiny_recording(40, 20, joints=3, names=joints)
+    action, state = made.features[ACTION], made.features[STATE][1]
+    parts = {f"{STATE}.arm": (joints[:2], state[:, :2], "float32"), f"{STATE}.gripper": (None, state[:, 2:], "float32")}
+    write_v3(tmp_path / "recordings/tape", replace(made, features={"actions": action} | parts))
+    scores(tmp_path / "recordings/force.parquet", episodes=40)
+    demos, _ = load_experiment(from_config(load_config(tmp_path / "demobench.toml"), "tape", tmp_path), tmp_path)
+    assert demos.episodes == 38
+    kept = ~np.isin(np.repeat(np.arange(40), 20), demos.excluded)
+    np.testing.assert_array_equal(demos.columns[STATE], state[kept])
+    assert demos.features[STATE].names == demos.features[ACTION].names == joints
+    assert demos.features[STATE].units == demos.features[ACTION].units == ("deg", "deg", "mm")
+    assert demos.warnings == ()
 
 
 # What makes a reading stale

@@ -183,6 +183,16 @@ def test_a_column_that_holds_no_table_of_numbers(refusal, column: pa.Array, got:
     assert "expected episode_index, frame_index and one column of finite numbers, or of lists of one length" in text
 
 
+def test_words_are_refused_before_they_are_decoded(tmp_path: Path):
+    """One long word, repeated, is a few bytes in a file and gigabytes in memory; here its pages are garbage."""
+    path = write(tmp_path / "score.parquet", rows(value=["word" * 1000] * 9))
+    content = bytearray(path.read_bytes())
+    content[4:600] = b"\xff" * 596
+    path.write_bytes(content)
+    with pytest.raises(DatasetError, match="'value' has values of type string"):
+        joined(path)
+
+
 def test_lists_of_other_lengths_in_another_batch(refusal, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(arrays, "VALUES_AT_A_TIME", 1)
     assert "'value' has 1 and 2 numbers a frame" in refusal(rows(value=pa.array([[1.0]] * 8 + [[1.0, 2.0]])))
@@ -246,7 +256,9 @@ def test_it_is_a_feature_like_any_other(folder: Path):
 
 @pytest.mark.parametrize("name", ["action", "observation.state", "next.done", "frame_index", "observation.image"])
 def test_a_name_that_is_taken(folder: Path, name: str):
-    edit_info(folder, lambda info: info["features"].update({"observation.image": {"dtype": "image", "shape": [3, 8, 8]}}))
+    edit_info(
+        folder, lambda info: info["features"].update({"observation.image": {"dtype": "image", "shape": [3, 8, 8]}})
+    )
     with pytest.raises(ConfigError, match=rf"features\] {name}: the data set has a feature of that name already"):
         read_dataset(folder, name="set", choice=with_feature(folder, name))
 
