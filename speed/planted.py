@@ -207,9 +207,9 @@ def _leap(feature: str, share: float, stays: bool):
     return change
 
 
-def _lose_frames(seconds: float):
+def _lose_frames(seconds: float, least: int = 6):
     def change(demos, episode, random):
-        lost = max(6, round(seconds * demos.fps))
+        lost = max(least, round(seconds * demos.fps))
         at = len(episode.times) // 2
         keep = np.r_[0:at, at + lost : len(episode.times)]
         return [replace(episode, columns={k: v[keep] for k, v in episode.columns.items()}, times=episode.times[keep])]
@@ -226,9 +226,13 @@ def _stand_still(times: np.ndarray) -> np.ndarray:
     return times
 
 
-def _wait(demos, episode, random):
-    frames = round(5 * demos.fps)
-    return [episode.take(np.r_[0 : len(episode.times), np.full(frames, len(episode.times) - 1)])]
+def _wait(seconds: float, at_start: bool = False):
+    def change(demos, episode, random):
+        frames, last = round(seconds * demos.fps), len(episode.times) - 1
+        before, after = (frames, 0) if at_start else (0, frames)
+        return [episode.take(np.clip(np.arange(-before, last + 1 + after), 0, last))]
+
+    return change
 
 
 def _stay(demos, episode, random):
@@ -272,21 +276,28 @@ FAULTS = (
     Fault("joint frozen for 3 s", "frozen", "one joint's state repeats for 3 s where it moves most", _freeze(3.0), True),
     Fault("joint frozen for 1 s", "frozen", "the same for 1 s", _freeze(1.0), True),
     Fault("telemetry frozen for 1 s", "frozen", "all of the state repeats for 1 s", _freeze(1.0, every=True), True),
+    Fault("telemetry frozen for 0.5 s", "frozen", "the same for 0.5 s", _freeze(0.5, every=True), True),
     Fault("joint frozen throughout", "frozen", "one joint's state is one number in the whole episode", _constant),
     Fault("episode repeated", "duplicate", "an episode is there twice", _repeat()),
     Fault("repeated, shifted and cut", "duplicate", "a copy lacks five frames at either end", _repeat(shift=5)),
     Fault("repeated with noise", "duplicate", "a copy with noise of 0.1 % of the range", _repeat(noise=0.001)),
+    Fault("repeated with more noise", "duplicate", "a copy with noise of 0.3 % of the range", _repeat(noise=0.003)),
     Fault("state leaps for a frame", "jump", "one state is off by 30 % of its range for one frame", _leap(STATE, 0.3, False)),
+    Fault("state leaps less", "jump", "the same by 15 %", _leap(STATE, 0.15, False)),
     Fault("action leaps and stays", "jump", "one action is off by 60 % of its range from a frame on", _leap(ACTION, 0.6, True)),
     Fault("frames lost, 0.3 s", "clock", "0.3 s of frames (at least six) are missing", _lose_frames(0.3)),
+    Fault("three frames lost", "clock", "three frames are missing", _lose_frames(0, least=3)),
     Fault("clock stands still", "clock", "three frames have one time", _clock(_stand_still)),
     Fault("clock at another rate", "clock", "the episode's clock runs 1.5 times as slowly", _clock(lambda times: times * 1.5)),
-    Fault("waits 5 s at the end", "idle", "the last frame repeats for 5 s", _wait),
+    Fault("waits 5 s at the end", "idle", "the last frame repeats for 5 s", _wait(5.0)),
+    Fault("waits 5 s at the start", "idle", "the first frame repeats for 5 s", _wait(5.0, at_start=True)),
+    Fault("waits 2.5 s at the start", "idle", "the same for 2.5 s", _wait(2.5, at_start=True)),
     Fault("nothing moves", "short", "the first frame throughout", _stay),
     Fault("cut off after 5 frames", "short", "five frames are left", _cut_off),
     Fault("five times as long", "outlier", "every frame five times", _stretch),
     Fault("another pose", "outlier", "one joint is off by 80 % of its range throughout", _elsewhere),
     Fault("state 0.3 s late", "tracking", "the state is stored 0.3 s late against actions", _late(0.3), True),
+    Fault("state 0.2 s late", "tracking", "the same by 0.2 s, or four frames", _late(0.2), True),
     Fault("joint does not follow", "tracking", "one joint's commands run backwards", _unplugged, True),
 )  # fmt: skip
 """Faults of one episode. Those of a whole data set are below."""

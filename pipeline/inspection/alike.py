@@ -6,7 +6,7 @@ is small and quick. Two episodes that meet there at one and the same shift are t
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -14,8 +14,11 @@ from pipeline.inspection.finding import Finding
 from pipeline.inspection.survey import Survey
 from pipeline.types import ACTION, STATE
 
-PROJECTIONS, ASKED, NEAR, MOST = 4, 8, 2e-3, 64
-"""Numbers a frame is looked up by, frames asked of each episode, how near counts (in spans), and neighbours looked at."""
+PROJECTIONS, ASKED, MOST = 4, 8, 64
+"""Numbers a frame is looked up by, frames asked of each episode, and neighbours looked at."""
+
+NEAR, NEAR_A_MILLION = 6e-3, 2e-3
+"""How near counts, in spans: the more frames, the nearer, so that about as many lie within it (and take as long)."""
 
 BATCH = 4096
 """Frames that are looked up at once; what is found for them takes a kilobyte a frame."""
@@ -26,12 +29,13 @@ task are never that exact), over at least 60 % of the shorter episode."""
 
 
 def check_duplicates(survey: Survey) -> Iterator[Finding]:
-    candidates = _candidates(survey)
+    scales = {feature: _scales(survey, feature) for feature in (ACTION, STATE)}
+    candidates = _candidates(survey, scales)
     told: set[int] = set()
     for (one, other, shift), _ in candidates.most_common():
         if one in told or other in told:
             continue
-        frames, difference = _compare(survey, one, other, shift)
+        frames, difference = _compare(survey, scales, one, other, shift)
         shorter = min(survey.demos.lengths[one], survey.demos.lengths[other])
         if frames < OVERLAP * shorter or difference > SAME:
             continue
@@ -46,22 +50,27 @@ def check_duplicates(survey: Survey) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _candidates(survey: Survey) -> Counter:
+def _candidates(survey: Survey, scales: Mapping[str, np.ndarray]) -> Counter:
     """(episode, other episode, shift) → how many of the frames asked met there; at least a quarter of them."""
     from scipy.spatial import cKDTree
 
-    points = _points(survey)
+    points = _points(survey, scales)
     if points is None or survey.demos.episodes < 2:
         return Counter()
     asked = _asked(survey, points)
     tree = cKDTree(points, balanced_tree=False)
-    met: Counter = Counter()
+    reach, met = _reach(len(points)), Counter()
     for first in range(0, len(asked), BATCH):
         frames = asked[first : first + BATCH]
-        distances, found = tree.query(points[frames], k=min(MOST, len(points)), distance_upper_bound=NEAR)
+        distances, found = tree.query(points[frames], k=min(MOST, len(points)), distance_upper_bound=reach)
         for frame, near in zip(frames, np.where(np.isfinite(distances), found, -1), strict=True):
             met.update(_meetings(survey.starts, int(frame), near[near >= 0]))
     return Counter({pair: count for pair, count in met.items() if count >= ASKED // 4})
+
+
+def _reach(frames: int) -> float:
+    """How near counts among so many frames."""
+    return min(NEAR, NEAR_A_MILLION * (1e6 / frames) ** (1 / PROJECTIONS))
 
 
 def _meetings(starts: np.ndarray, frame: int, near: np.ndarray) -> set[tuple[int, int, int]]:
@@ -77,9 +86,8 @@ def _pair(one: int, other: int, shift: int) -> tuple[int, int, int]:
     return (int(one), int(other), int(shift)) if one < other else (int(other), int(one), -int(shift))
 
 
-def _points(survey: Survey) -> np.ndarray | None:
+def _points(survey: Survey, scales: Mapping[str, np.ndarray]) -> np.ndarray | None:
     """[N, PROJECTIONS]; float64, because a tree copies anything else."""
-    scales = {feature: _scales(survey, feature) for feature in (ACTION, STATE)}
     living = [(f, int(i)) for f in (ACTION, STATE) for i in np.flatnonzero(scales[f])]
     if not living:
         return None
@@ -106,12 +114,12 @@ def _asked(survey: Survey, points: np.ndarray) -> np.ndarray:
         frames = survey.demos.episode(episode)
         speed = np.abs(np.diff(points[frames], axis=0)).max(axis=1) if frames.stop - frames.start > 1 else np.zeros(0)
         for part in np.array_split(np.arange(len(speed)), ASKED):
-            if len(part) and speed[part].max() > NEAR:
+            if len(part) and speed[part].max() > NEAR_A_MILLION:
                 asked.append(frames.start + int(part[np.argmax(speed[part])]))
     return np.array(asked, np.int64)
 
 
-def _compare(survey: Survey, one: int, other: int, shift: int) -> tuple[int, float]:
+def _compare(survey: Survey, scales: Mapping[str, np.ndarray], one: int, other: int, shift: int) -> tuple[int, float]:
     """How many frames overlap, and their mean difference in spans."""
     starts, lengths = survey.starts, survey.demos.lengths
     low, high = max(0, -shift), min(int(lengths[one]), int(lengths[other]) - shift)
@@ -119,11 +127,10 @@ def _compare(survey: Survey, one: int, other: int, shift: int) -> tuple[int, flo
         return 0, np.inf
     total, columns = 0.0, 0
     for feature in (ACTION, STATE):
-        scales = _scales(survey, feature)
-        keep = scales > 0
+        keep = scales[feature] > 0
         values = survey.demos.columns[feature]
         a = values[starts[one] + low : starts[one] + high][:, keep]
         b = values[starts[other] + low + shift : starts[other] + high + shift][:, keep]
-        total += float((np.abs(a - b) / scales[keep]).mean(axis=0).sum())
+        total += float((np.abs(a - b) / scales[feature][keep]).mean(axis=0).sum())
         columns += int(keep.sum())
     return high - low, total / max(1, columns)

@@ -24,6 +24,10 @@ FROZEN_S, FROZEN = 0.3, 0.2
 coarse encoders repeat as well, while the command moves by up to 13 % of the span on the SO-101. Its gripper, closed on an
 object, does so to 21 %: grippers are told apart by their name, and by how often their column does this."""
 
+TOGETHER = 0.4
+"""All of the state repeats at once for 0.3 s or longer while what the commands move by, in spans of their joints, adds up
+to this. On the SO-101 at rest it adds up to 0.24."""
+
 OFTEN = 0.2
 """Share of the episodes from which half as much is how the hardware is: a gripper, whatever its name."""
 
@@ -89,10 +93,44 @@ def _movers(survey: Survey) -> np.ndarray:
 
 
 def check_frozen(survey: Survey) -> Iterator[Finding]:
+    told: set[int | None] = set()
+    for command in _commands(survey):
+        for finding in _frozen(survey, command, survey.column(STATE, command.partner)):
+            told.add(finding.episode)
+            yield finding
+    yield from (finding for finding in _together(survey) if finding.episode not in told)
+    yield from _constant(survey)
+
+
+def _commands(survey: Survey) -> Iterator[Column]:
+    """Action columns that command a state column that moves; no grippers."""
     for command in survey.living(ACTION):
         if command.partner is not None and not survey.dead[STATE][command.partner] and not command.is_gripper:
-            yield from _frozen(survey, command, survey.column(STATE, command.partner))
-    yield from _constant(survey)
+            yield command
+
+
+def _together(survey: Survey) -> Iterator[Finding]:
+    """Stretches in which every state repeats exactly while the arm is told to go elsewhere: its telemetry stands still."""
+    same = np.ones(survey.demos.frames, bool)
+    for state in survey.living(STATE):
+        same[:-1] &= state.values[1:] == state.values[:-1]
+    same[survey.starts[1:] - 1] = False
+    first, stop = runs(same, survey.starts)
+    long = stop - first >= survey.frames(FROZEN_S, least=4)
+    first, stop = first[long], stop[long]
+    told = np.zeros(len(first))
+    for command in _commands(survey):
+        span = survey.spans[STATE][command.partner]
+        told += [_told(survey, command, one, other) / span for one, other in zip(first, stop, strict=True)]
+    for one, other, share in zip(first, stop, told, strict=True):
+        episode = int(np.searchsorted(survey.starts, one, side="right")) - 1
+        if share > TOGETHER:
+            yield Finding(
+                "frozen", survey.id(episode), None, float(share), TOGETHER,
+                f"All of the state repeats exactly for {survey.seconds(other - one):.1f} s from frame "
+                f"{one - survey.starts[episode]} on, while commands move by {share:.0%} of their joints' usual ranges, added up.",
+                grave=True,
+            )  # fmt: skip
 
 
 def _frozen(survey: Survey, command: Column, state: Column) -> Iterator[Finding]:

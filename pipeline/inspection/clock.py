@@ -13,8 +13,8 @@ WRONG_RATE = 0.05
 OFF, UNEVEN = 0.2, 0.01
 """A tick is off when it differs from 1 / fps by a fifth; more than one in a hundred makes an uneven clock."""
 
-GAP, GAP_S = 4.0, 1.0
-"""A gap is a tick of at least four usual ones (three frames lost); from a second on the episode is broken in two."""
+GAP, GAP_S = 3.5, 1.0
+"""A gap is a tick of about four usual ones (three frames lost) or more; from a second on the episode is broken in two."""
 
 EPISODE_RATE = 0.2
 """Share by which an episode's own usual tick may differ from that of the data set."""

@@ -25,6 +25,9 @@ LOOK_AT, MOST_SAID = 5, 20
 MOST_EXCLUDED = 0.5
 """Share of the episodes above which leaving them out is no remedy: the data set has the fault, not the episodes."""
 
+_STANDS = ("short", "clock", "duplicate", "video")
+"""What is said of an episode that holds no demonstration."""
+
 Say = Callable[[str, int, int], None]
 """`say(what, done, total)`: what is being looked at."""
 
@@ -107,7 +110,7 @@ def inspect(
         if say:
             say(name, number, len(detectors))
         found += detect()
-    findings = gather(found, demos.episodes)
+    findings = gather(_without_echoes(found), demos.episodes)
     exclude = sorted({f.episode for f in findings if f.grave and f.episode is not None})
     return Inspection(
         findings, _look_at(findings), tuple(exclude) if len(exclude) <= MOST_EXCLUDED * demos.episodes else (),
@@ -132,9 +135,23 @@ def _look_at(findings: Sequence[Finding]) -> tuple[tuple[int, tuple[str, ...]], 
         return sum(max(f.weight for f in mine if f.check == check) for check in {f.check for f in mine})
 
     ranked = sorted(of_episode, key=lambda episode: (-weight(of_episode[episode]), episode))[:LOOK_AT]
+    return tuple((episode, _reasons(of_episode[episode])) for episode in ranked)
+
+
+def _reasons(mine: Sequence[Finding]) -> tuple[str, ...]:
+    """The weightiest finding of each check, and how many more it has."""
+    reasons = {}
+    for finding in sorted(mine, key=lambda finding: -finding.weight):
+        reasons.setdefault(finding.check, []).append(finding.words)
     return tuple(
-        (episode, tuple(f.words for f in sorted(of_episode[episode], key=lambda f: -f.weight))) for episode in ranked
+        first + (f" (And {len(more)} more of this kind.)" if more else "") for first, *more in reasons.values()
     )
+
+
+def _without_echoes(findings: Sequence[Finding]) -> list[Finding]:
+    """An episode that holds no demonstration is unlike the others in every way: once is enough."""
+    empty = {finding.episode for finding in findings if finding.check == "short"}
+    return [f for f in findings if f.episode is None or f.episode not in empty or f.check in _STANDS]
 
 
 __all__ = ["CHECKS", "Inspection", "inspect", "view_command"]

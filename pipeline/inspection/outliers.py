@@ -18,7 +18,7 @@ SHORT_S, SHORT_FRAMES = 1.0, 10
 FEWEST = 5
 """Episodes below which nothing is called unlike the others."""
 
-LENGTH, DEVIATIONS = 2.5, 4.0
+LENGTH, DEVIATIONS = 3.0, 4.0
 """How many times longer or shorter than the median, and how many deviations of the logarithm, an odd length is."""
 
 POINTS = 16

@@ -28,6 +28,10 @@ LATE_LIMIT_S = 0.5
 EPISODE_LAG, EPISODE_LAG_S = 2.5, 0.1
 """Frames, and seconds, by which an episode's lag may differ from that of the data set; the larger counts."""
 
+CLEARLY = 0.05
+"""By how much the correlation must be larger at an episode's own lag than at the usual one: a gripper that stops at what it
+holds follows about as well at many lags. Or by as much as it falls short of 1, where that is less: smooth motion."""
+
 WORSE, DEVIATIONS = 3.0, 8.0
 """An episode follows worse when its mean |a − s| is three times the median and eight deviations above it, and at least
 2 % of the joint's span."""
@@ -39,6 +43,7 @@ class Following:
 
     column  the command, without its values
     lag   frames; NaN where it does not follow       correlation  at that lag
+    better  [E] how much larger the correlation is at the episode's own lag than at that of all
     gap   [E] mean |a − s| of a position command, in its unit; NaN for others
     """
 
@@ -47,6 +52,7 @@ class Following:
     correlation: float
     lags: np.ndarray
     correlations: np.ndarray
+    better: np.ndarray
     gap: np.ndarray
 
 
@@ -69,6 +75,7 @@ def _follow(survey: Survey, command: Column, state: Column) -> Following:
         )
     whole, correlation = _peak(lags, everything[:, None])
     own, correlations = _peak(lags, each)
+    usual = each[np.searchsorted(lags, round(float(whole[0])))]
     moves = energy > 0.1 * energy.mean()  # not the median: most episodes may leave a joint alone
     gap = np.full(survey.demos.episodes, np.nan)
     if command.kind == "position" and not command.circular:
@@ -76,7 +83,7 @@ def _follow(survey: Survey, command: Column, state: Column) -> Following:
     return Following(
         replace(command, values=command.values[:0]),
         float(whole[0]) if correlation[0] >= DOES_NOT else float("nan"), float(correlation[0]),
-        np.where(moves, own, np.nan), np.where(moves, correlations, np.nan), gap,
+        np.where(moves, own, np.nan), np.where(moves, correlations, np.nan), correlations - usual, gap,
     )  # fmt: skip
 
 
@@ -137,6 +144,7 @@ def _episodes(survey: Survey, following: Following) -> Iterator[Finding]:
     limit = max(EPISODE_LAG, survey.frames(EPISODE_LAG_S))
     lost = known & (following.correlations < DOES_NOT)
     late = known & (following.correlations >= FOLLOWS) & (np.abs(following.lags - usual) > limit)
+    late &= following.better > np.minimum(CLEARLY, 1 - following.correlations)
     for episode in np.flatnonzero(lost):
         yield Finding(
             "tracking", survey.id(episode), column.key, float(following.correlations[episode]), DOES_NOT,

@@ -62,10 +62,19 @@ def test_a_joint_that_freezes_while_it_is_told_to_move_is_grave(seconds):
     assert look(takes).exclude == (14,)
 
 
-def test_telemetry_that_repeats_altogether_is_found():
+@pytest.mark.parametrize("seconds", [0.5, 1.5])
+def test_telemetry_that_repeats_altogether_is_found(seconds):
+    """Sooner than one joint: no three joints stick at once."""
     takes = arm_takes()
-    takes[4].state[20:50] = takes[4].state[20]
+    takes[4].state[20 : 20 + round(seconds * FPS)] = takes[4].state[20]
     assert only(takes, "frozen", 4).grave
+
+
+def test_an_arm_that_rests_altogether_is_not_frozen():
+    takes = [
+        take.frames([*range(60), *[60] * 20, *range(60, len(take.seconds))], new_clock=True) for take in arm_takes()
+    ]
+    assert not found(takes, "frozen")
 
 
 def test_a_column_that_one_episode_never_moves_is_found():

@@ -26,6 +26,14 @@ def test_lost_frames_are_a_gap_in_their_episode():
     assert not finding.grave
 
 
+def test_three_lost_frames_are_found_though_the_clock_jitters():
+    takes, random = arm_takes(), np.random.default_rng(0)
+    for take in takes:
+        take.seconds = take.seconds + random.uniform(-0.1, 0.1, len(take.seconds)) / FPS
+    takes[3] = takes[3].frames(np.delete(np.arange(100), slice(40, 43)))
+    only(takes, "clock", 3)
+
+
 def test_a_second_without_frames_is_worth_leaving_the_episode_out():
     takes = arm_takes()
     takes[3] = takes[3].frames(np.delete(np.arange(100), slice(40, 65)))
