@@ -91,6 +91,7 @@ def _write_table(bench: Bench, draft) -> Outcome:
     facts = bench.summary(Unit("demonstrations"))["inspect"]
     modes = json.loads((plan.folder(Unit("action_modes")) / "modes.json").read_text(encoding="utf-8"))
     built = build_table(facts, bench.experiment, bench.split, floors, estimates, entries, modes)
+    built["key"] = plan.key
     write_json(draft / "table.json", built)
     rows = [
         (

@@ -277,7 +277,24 @@ def resolve_target(
     )
 
 
+def known_as(argument: str, config: Config, registered: Iterable[str]) -> str:
+    """The key of a data set that was only ever benchmarked with other settings: `tape` → `tape+3fa9c1d2`.
+
+    Raises:
+        ConfigError: there are several.
+    """
+    if argument in config.datasets or argument in set(registered):
+        return argument
+    variants = sorted(key for key in registered if key.split("+")[0] == argument)
+    if len(variants) > 1:
+        raise ConfigError(
+            f"'{argument}' was benchmarked with several settings: {', '.join(variants)}. Name one of them."
+        )
+    return variants[0] if variants else argument
+
+
 def _base(argument: str, config: Config, config_dir: Path, registered: Mapping[str, Any]) -> tuple[str, Experiment]:
+    argument = argument if Path(argument).is_dir() else known_as(argument, config, registered)
     if argument in config.datasets:
         return argument, from_config(config, argument, config_dir)
     if argument in registered:

@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.config import Config, parse_config
 from pipeline.errors import ConfigError
-from pipeline.experiment import Choices, parse_chunks, resolve_target, select_rows, variants
+from pipeline.experiment import Choices, known_as, parse_chunks, resolve_target, select_rows, variants
 
 CONFIG = parse_config(
     {
@@ -126,3 +126,13 @@ def test_rows_of_other_observation_sets_are_left_out_and_baselines_stay():
         {"policy": "elsewhere", "method": "mlp", "observations": "pose"},
     ]
     assert select_rows(rows, asked) == [rows[0], rows[3]]
+
+
+def test_a_data_set_is_found_by_its_short_name_as_long_as_there_is_one():
+    config = parse_config({"datasets": {"own": {"source": "own"}}}, "file")
+    assert known_as("tape", config, ["tape+1234abcd", "other"]) == "tape+1234abcd"
+    assert known_as("tape", config, ["tape", "tape+1234abcd"]) == "tape"
+    assert known_as("own", config, ["own+1234abcd"]) == "own"
+    assert known_as("nothing", config, ["tape+1234abcd"]) == "nothing"
+    with pytest.raises(ConfigError, match=r"several settings: tape\+a, tape\+b. Name one"):
+        known_as("tape", config, ["tape+b", "tape+a"])

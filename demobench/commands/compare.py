@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from demobench.commands.session import Session, open_session, write_json_to
 from pipeline.errors import ConfigError, StoreError, did_you_mean
-from pipeline.experiment import Choices, Variant, no_such_dataset, resolve_target
+from pipeline.experiment import Choices, Variant, known_as, no_such_dataset, resolve_target
 from pipeline.methods import EXTERNAL
 
 if TYPE_CHECKING:
@@ -141,9 +141,10 @@ def _entries(address: Address, session: Session) -> list[Entry]:
     from assets_defs.plan import Plan
 
     registered = session.store.experiments()
-    if address.dataset not in registered and address.dataset not in session.config.datasets:
-        raise no_such_dataset(address.dataset, {*registered, *session.config.datasets})
-    target = resolve_target(address.dataset, session.config, session.config_dir, Choices(), registered)
+    dataset = known_as(address.dataset, session.config, registered)
+    if dataset not in registered and dataset not in session.config.datasets:
+        raise no_such_dataset(dataset, {*registered, *session.config.datasets})
+    target = resolve_target(dataset, session.config, session.config_dir, Choices(), registered)
     # Two results of the store can be compared although their source has moved since: the data hash says what they are of.
     plan = Plan(
         session.store, target.key, target.experiment, tuple(target.experiment.variants), look_at_source=False

@@ -27,6 +27,10 @@ def view_episode(
     session = open_session(config_path, store_path)
     target, demos, semantics = open_dataset(argument, session)
     position = np.flatnonzero(demos.episode_ids == episode)
+    if episode in demos.excluded:
+        raise ConfigError(
+            f"Episode {episode} of '{target.key}' is left out by the configuration (exclude). Take it from the list."
+        )
     if not len(position):
         raise ConfigError(
             f"'{target.key}' has no episode {episode}. Its episodes are {demos.episode_ids.min()} to {demos.episode_ids.max()}."

@@ -48,6 +48,11 @@ def answer(table: Table) -> list[Sentence]:
 # Policies -------------------------------------------------------------------------------------------------------------
 
 
+def key_of(table: Table) -> str:
+    """What commands call the data set with these settings: `tape`, `tape+3fa9c1d2`."""
+    return table.get("key") or table["dataset"]["name"]
+
+
 def address(row: Row) -> str:
     return f"{row['policy']}/{row['observations']}"
 
@@ -147,7 +152,9 @@ def dataset_unit(table: Table) -> str:
 def _best(table: Table, best: Row) -> Sentence:
     interval = show_interval((best.get("interval") or {}).get("first_step_mae"))
     value = Strong(f"{show(best['first_step_mae'])}{dataset_unit(table)}")
-    said = ["The lowest first-step error is that of ", *who(best), ": ", value, f" {interval}".rstrip(), ". "]
+    held_out = sum(len(fold["test"]) for fold in table["split"]["folds"])
+    among = f" of the rows on all {held_out} held-out episodes" if any(map(is_elsewhere, table["policies"])) else ""
+    said = [f"The lowest first-step error{among} is that of ", *who(best), ": ", value, f" {interval}".rstrip(), ". "]
     if best["policy"] == "hold_still":
         return [*said, "So no policy is better than holding still."]
     found = compared(table, address(best), "hold_still")
@@ -208,7 +215,7 @@ def _second(table: Table, rows: Sequence[Row], best: Row) -> list[Sentence]:
         return [["It is ", Strong("better than the second"), f", {name}."]]
     if found := forth or back:
         return [["It ", Strong("cannot be told from the second"), f", {name}: {found['words']}."]]
-    all_pairs = f"demobench compare {table['dataset']['name']}"
+    all_pairs = f"demobench compare {key_of(table)}"
     return [["Whether it is better than the second, ", name, f", is not tested here; {all_pairs} tests all pairs."]]
 
 
