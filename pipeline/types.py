@@ -273,6 +273,7 @@ class FloorEstimate:
     upper        the upper end of where it lies; None for `gamma`, which estimates the floor itself
     interval     95 %: of the value, or of the whole span from value to upper
     below        where refused: what the floor does not exceed (one-sided 95 %), if that can be said
+    wrong        what extrapolation may be wrong by, on the squared scale (Γ, or D₀²); part of the interval
     influence    [E] how much each episode moved the estimate on the squared scale (Γ, or D₀²)
     counted_twice  the part of Σ influence² that is counted twice (`floors.standard_error`)
     nearest      the mean distance of the nearest neighbours, in deviations of one input column
@@ -288,6 +289,7 @@ class FloorEstimate:
     interval: tuple[float, float] | None
     below: float | None
     refused: str | None
+    wrong: float
     influence: np.ndarray
     counted_twice: float
     nearest: float

@@ -186,18 +186,18 @@ def _verdict_words(table: Table) -> str:
 
 def _floors(table: Table) -> dict[str, str]:
     """What floors are made of, assume, and when they are refused."""
-    from pipeline.statistics.floors import CURVED, FEWEST_EPISODES, MOST_REMOVED, NEAREST
+    from pipeline.statistics.floors import FEWEST_EPISODES, JUMPY, MOST_EXPLAINED, MOST_REMOVED, NEAREST
 
     refused = (
-        f"Refused where extrapolation would take away more than {100 * MOST_REMOVED:.0f} %, and below {FEWEST_EPISODES} "
-        "episodes."
+        f"Refused where extrapolation would take away more than {100 * MOST_REMOVED:.0f} %, where the regression leaves more "
+        f"than {1 / (1 - MOST_EXPLAINED):.0f} times the estimate on held-out episodes, and below {FEWEST_EPISODES} episodes."
     )
     return {
         "Floor in RMSE (gamma)": (
-            f"For each held-out state the nearest frame of each of the {NEAREST} nearest other episodes. Half the mean "
-            "squared difference of the actions, extrapolated to states that do not differ (Evans & Jones 2002). It assumes "
-            "that the mean action changes smoothly with what is seen; where a jump, as of a gripper that closes, could be "
-            f"{100 * CURVED:.0f} % of the estimate, it is refused. {refused}"
+            "A regression that saw neither of two episodes takes away what it can explain. For each held-out state follows the "
+            f"nearest frame of each of the {NEAREST} nearest other episodes: half the mean squared difference of what is left "
+            "of their actions, extrapolated to states that do not differ (Evans & Jones 2002). Where the mean action may jump, "
+            f"as of a gripper that closes, and the jump could be {100 * JUMPY:.0f} % of the estimate, it is refused. {refused}"
         ),
         "Floor in MAE and L2 (pair distance)": (
             "How far the actions of two people in the same place are apart, extrapolated likewise. The floor lies between "

@@ -109,7 +109,8 @@ def _gap(values: np.ndarray, episodes: np.ndarray, fold: np.ndarray, floor: Floo
     moved = -share * floor.influence
     moved[episodes] += slope * (of_seeds - mean.value) / len(episodes)
     spread = np.hypot(standard_error(moved, share**2 * floor.counted_twice), slope * mean.seed_se)
-    half = t_quantile(0.975, len(episodes) - 1) * spread
+    # The policy and the floor share their noise, not what the floor's extrapolation may be wrong by.
+    half = t_quantile(0.975, len(episodes) - 1) * spread + share * floor.wrong
     centre = squared - floor.value**2
     # From the squared scale to the unit: a gap x of squares is an error less the root of what is left of its square.
     low, high = (float(error - np.sqrt(max(0.0, squared - x))) for x in (centre - half, centre + half))

@@ -26,39 +26,63 @@ from pipeline.lerobot_format.quality import dead_columns
 from pipeline.normalize import circular_columns, fit_scaler
 from pipeline.statistics.intervals import FEWEST, t_quantile
 from pipeline.statistics.neighbours import Neighbours, find_neighbours
+from pipeline.statistics.pilot import Pilot, fit_pilot
 from pipeline.types import ACTION, Demonstrations, FloorEstimate, ObservationSet, Semantics, Split
 
 NEAREST = 10
 """The neighbours of a state that count: one frame of each of so many other episodes."""
 
 FEWER, MORE = 5, 20
-"""Other fits: over fewer, to see how straight the line is; over more, to see whether it is one."""
+"""Other fits: over fewer, to see how straight the line is; over more, to see whether values still grow."""
 
 FEWEST_EPISODES = 30
 MOST_SCORED = 20_000
 MOST_ELSEWHERE = 8_000
-"""States at which the law of the extrapolation is looked at where only some episodes are held out."""
+"""States at which a jump is looked for where only some episodes are held out."""
+
+MOST_FITTED = 20_000
+"""States that the pilot regression learns from, the same share of each episode."""
 
 MOST_REMOVED = 0.5
 """The share of the nearest neighbours' value that extrapolation may take away."""
 
-CURVED = 0.12
+JUMPY = 0.07
 """The share of an estimate that a jump in the mean action may account for, before the estimate is refused."""
 
-TOLD_APART, TOLD_APART_TOGETHER = 1.35, 1.5
-"""How many times worse the law of a jump must fit, in mean squared residuals, to be ruled out: one column, all together."""
+SURE_OF_JUMP = 5.0
+"""How many standard errors a jump needs, to be taken off the estimate."""
 
-SHARE_IN_DOUBT = 0.1
-"""Of what extrapolation takes away, so much joins the interval."""
+MOST_EXPLAINED = 0.5
+"""The share of the pilot's own error on held-out episodes that the floor may leave to be explained."""
+
+MOST_KEPT = 0.75
+"""The least that extrapolation gives without the pilot, as a share of what it gives with it; clearly less, and it is refused."""
+
+SMALLEST = 0.01
+"""In deviations of the actions: below it, what the pilot misses and what people disagree about look alike."""
+
+SHARE_IN_DOUBT = 0.5
+"""Of what the fit takes away from the nearest neighbours, or from the pilot's error, so much joins the interval."""
 
 TOO_FAR = (
     "the nearest states differ too much: extrapolation to distance zero would take away {:.0f} % of what they show"
 )
-A_JUMP = (
-    "the mean action may jump from state to state (a gripper that closes): a jump could make up {} of the estimate, and the "
-    "data cannot tell"
+NOT_EXPLAINED = (
+    "the regression that takes the smooth part away is not good enough here: its squared error on held-out episodes is {:.1f} "
+    "times the estimate"
 )
-NOTHING: dict[str, None] = {"value": None, "upper": None, "interval": None}
+ADDED = (
+    "what people do changes too quickly with what is seen for the regression that takes the smooth part away: it adds to what "
+    "neighbours differ by"
+)
+TOO_SMALL = (
+    "people disagree by less than {:.0f} % of the actions' deviation, if at all: too little to tell it from zero"
+)
+A_JUMP = (
+    "the mean action may jump from state to state (a gripper that closes): a jump could make up {:.0f} % of the estimate, and "
+    "the data cannot tell"
+)
+NOTHING = {"value": None, "upper": None, "interval": None, "wrong": 0.0}
 
 Loss = Literal["rmse", "mae", "l2"]
 
@@ -117,15 +141,15 @@ def measure_floors(
     horizons = sorted(set(horizons))
     possible = [h for h in horizons if _reaches(states, h)] if reason is None else []
     found = _search(states, states.scored, possible)
-    laws = found
+    everywhere = found
     if len(np.unique(states.episode[states.scored])) < demos.episodes:
         # Whether a mean jumps is a property of the data, not of the share of them that is scored: all of them can tell.
-        everywhere = scored_frames(demos, np.arange(demos.episodes), states.first, MOST_ELSEWHERE)
-        laws = _search(states, everywhere, possible)
+        frames = scored_frames(demos, np.arange(demos.episodes), states.first, MOST_ELSEWHERE)
+        everywhere = _search(states, frames, possible)
     estimates = []
     for horizon in horizons:
         if horizon in found:
-            estimates += _estimate(states, found[horizon], laws[horizon], horizon)
+            estimates += _estimate(states, found[horizon], everywhere[horizon], horizon)
         else:
             why = reason or f"no two episodes have an action {horizon} steps after a state that is scored"
             estimates += [_refusal(states, horizon, loss, why) for loss in ("rmse", "mae", "l2")]
@@ -201,27 +225,42 @@ def _reaches(states: States, horizon: int) -> bool:
 # From neighbours to estimates -----------------------------------------------------------------------------------------
 
 
-def _estimate(states: States, found: Neighbours, laws: Neighbours, horizon: int) -> list[FloorEstimate]:
-    pairs, difference = _pairs(states, found), _differences(states, found, horizon)
+def _estimate(states: States, found: Neighbours, everywhere: Neighbours, horizon: int) -> list[FloorEstimate]:
+    pilot = _pilot(states, horizon)
+    pairs, difference = _pairs(states, found), _differences(states, pilot, found, horizon)
     squared = difference**2
-    everywhere, apart_everywhere = pairs, squared
-    if laws is not found:
-        everywhere, apart_everywhere = _pairs(states, laws), _differences(states, laws, horizon) ** 2
-    columns = 0.5 * np.tensordot(everywhere.weights, apart_everywhere, axes=1) / squared.shape[2]
-    jump = _jump(everywhere.curve, columns)
-    estimates = [_judge(states, pairs, horizon, "rmse", 0.5 * squared.mean(axis=2), jump)]
+    recorded = 0.5 * (_recorded(states, found, horizon) ** 2).mean(axis=2)
+    jump = _jump(states, pilot, everywhere, horizon)
+    doubt = _doubt(states, pilot, pairs, 0.5 * squared.mean(axis=2), recorded, jump)
+    estimates = [_judge(states, pairs, horizon, "rmse", 0.5 * squared.mean(axis=2), doubt)]
+    doubt = doubt if doubt.by_pilot else Doubt()  # a bracket of a factor of two has room for a jump
     for loss, apart in (("mae", np.abs(difference).mean(axis=2)), ("l2", np.sqrt(squared.sum(axis=2)))):
         mean = pairs.weights @ apart
         # The square of a mean, pair by pair: its average is mean², and it moves with a pair as the square of the mean does.
-        estimates.append(_judge(states, pairs, horizon, loss, mean**2 + 2 * mean * (apart - mean)))
+        estimates.append(_judge(states, pairs, horizon, loss, mean**2 + 2 * mean * (apart - mean), doubt))
     return estimates
 
 
-def _differences(states: States, found: Neighbours, horizon: int) -> np.ndarray:
+def _pilot(states: States, horizon: int) -> Pilot:
+    """What a regression expects `horizon` steps later. Angles are left to the neighbours: their mean is no number."""
+    demos = states.demos
+    frames = scored_frames(demos, np.arange(demos.episodes), states.first, MOST_FITTED)
+    frames = frames[frames + horizon < demos.episode_starts[states.episode[frames] + 1]]
+    actions = np.where(states.circular, 0.0, states.actions[frames + horizon])
+    return fit_pilot(states.inputs[frames], actions, states.episode[frames], demos.episodes)
+
+
+def _recorded(states: States, found: Neighbours, horizon: int) -> np.ndarray:
     """[M, K, A] the action of a scored state less that of its neighbour, `horizon` steps later; angles wrapped."""
     difference = states.actions[found.scored + horizon][:, None] - states.actions[found.frames + horizon]
     difference[..., states.circular] = wrap(difference[..., states.circular])
     return difference
+
+
+def _differences(states: States, pilot: Pilot, found: Neighbours, horizon: int) -> np.ndarray:
+    """[M, K, A] the same, less what the pilot expects them to differ by."""
+    expected = pilot.differences(states.inputs, states.episode, found.scored, found.frames)
+    return _recorded(states, found, horizon) - expected
 
 
 @dataclass(frozen=True)
@@ -279,85 +318,127 @@ def standard_error(influence: np.ndarray, counted_twice: float = 0.0) -> float:
     return float(np.sqrt(max(jackknife - counted_twice, jackknife / 2) * episodes / (episodes - 1)))
 
 
-def _line(distance: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Least squares of value [K] on distance [K]: the weights [K] whose product with value is the intercept, the slope, and
-    the mean squared residual."""
+def _line(distance: np.ndarray, length: int | None = None) -> np.ndarray:
+    """[K] what to weigh values at `distance` [K] with, so that the sum is the intercept of their least-squares line;
+    followed by zeros up to `length`."""
     centred = distance - distance.mean()
-    square = float((centred**2).sum()) or 1.0
-    slope = float(centred @ value) / square
-    weights = 1 / len(value) - distance.mean() * centred / square
-    residual = value - value.mean() - slope * centred
-    return weights, slope, float((residual**2).mean())
+    weights = 1 / len(distance) - distance.mean() * centred / (float((centred**2).sum()) or 1.0)
+    return np.pad(weights, (0, (length or len(weights)) - len(weights)))
 
 
-def _judge(
-    states: States, pairs: Pairs, horizon: int, loss: Loss, apart: np.ndarray, jump: float = 0.0
-) -> FloorEstimate:
-    """One estimate on the squared scale (Γ or D₀²) from the pairs' values [M, K], or the reason why there is none.
+@dataclass(frozen=True)
+class Sum:
+    """A weighted sum over neighbours of their mean values, and how sure it is: `moved` as `Pairs.variance` has it."""
 
-    `jump` is how much of it a jump in the mean action may account for.
-    """
-    delta, value = pairs.curve, pairs.weights @ apart
-    weights, slope, _ = _line(delta[:NEAREST], value[:NEAREST])
-    estimate = float(weights @ value[:NEAREST])
-    residual = apart[:, :NEAREST] - slope * pairs.distance[:, :NEAREST] - estimate
-    influence, twice = pairs.variance(pairs.weights[:, None] * weights * residual)
-    half = t_quantile(0.975, pairs.df) * standard_error(influence, twice)
+    value: float
+    moved: tuple[np.ndarray, float]
+
+    @property
+    def error(self) -> float:
+        return standard_error(*self.moved)
+
+
+def _contrast(pairs: Pairs, apart: np.ndarray, weights: np.ndarray) -> Sum:
+    """The values [M, K] of pairs, weighted by rank [K]; each pair moves it by what it differs from its rank's mean."""
+    value = pairs.weights @ apart
+    return Sum(float(weights @ value), pairs.variance(pairs.weights[:, None] * weights * (apart - value)))
+
+
+def _intercept(pairs: Pairs, apart: np.ndarray) -> Sum:
+    """The values [M, K] of pairs, extrapolated to distance zero by the NEAREST; what distance explains moves nothing."""
+    delta, near = pairs.curve[:NEAREST], apart[:, :NEAREST]
+    weights, value = _line(delta), pairs.weights @ near
+    intercept = float(weights @ value)
+    slope = (float(value.mean()) - intercept) / (float(delta.mean()) or 1.0)
+    residual = near - slope * pairs.distance[:, :NEAREST] - intercept
+    return Sum(intercept, pairs.variance(pairs.weights[:, None] * weights * residual))
+
+
+def _judge(states: States, pairs: Pairs, horizon: int, loss: Loss, apart: np.ndarray, doubt: "Doubt") -> FloorEstimate:
+    """One estimate on the squared scale (Γ or D₀²) from the pairs' values [M, K], or the reason why there is none."""
+    found, nearest = _intercept(pairs, apart), float(pairs.weights @ apart[:, 0])
+    removed = 1.0 - found.value / nearest if nearest > 0 else 1.0
+    refused = TOO_FAR.format(100 * min(1.0, removed)) if removed > MOST_REMOVED else doubt.refused
+    influence, twice = found.moved
     described = _described(states, horizon, loss) | {
-        "influence": influence, "counted_twice": twice, "nearest": float(np.sqrt(delta[0] / states.inputs.shape[1]))
+        "influence": influence, "counted_twice": twice,
+        "nearest": float(np.sqrt(pairs.curve[0] / states.inputs.shape[1])),
     }  # fmt: skip
-    doubt = _doubt(delta, value, estimate, jump)
-    if doubt.refused:
-        first = pairs.variance(pairs.weights[:, None] * (apart[:, :1] - value[0]))
-        below = _root(value[0] + t_quantile(0.95, pairs.df) * standard_error(*first))
-        return FloorEstimate(**described, **NOTHING, below=below, refused=doubt.refused)
+    if refused:
+        first = _contrast(pairs, apart[:, :1], np.ones(1))
+        below = _root(first.value + t_quantile(0.95, pairs.df) * first.error)
+        return FloorEstimate(**described, **NOTHING, below=below, refused=refused)
+    taken = max(nearest, doubt.explained) - found.value
+    wrong = max(_bent(pairs, apart), SHARE_IN_DOUBT * taken, doubt.jump)
+    estimate, half = found.value - doubt.shift, t_quantile(0.975, pairs.df) * found.error + wrong
     share = 1.0 if loss == "rmse" else 0.5
-    half += doubt.wrong
     low, high = _root(estimate - half), _root(estimate + half)
     return FloorEstimate(
         **described, value=share * _root(estimate), upper=None if loss == "rmse" else _root(estimate),
-        interval=(share * low, high), below=None, refused=None,
+        interval=(share * low, high), below=None, refused=None, wrong=wrong,
     )  # fmt: skip
+
+
+def _bent(pairs: Pairs, apart: np.ndarray) -> float:
+    """What a line through the FEWER nearest says differently, beyond chance."""
+    ranks = apart.shape[1]
+    found = _contrast(pairs, apart, _line(pairs.curve[:FEWER], ranks) - _line(pairs.curve[:NEAREST], ranks))
+    return max(0.0, abs(found.value) - t_quantile(0.975, pairs.df) * found.error)
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """What extrapolating may be wrong by, on the squared scale, and why to refuse."""
+    """Why extrapolating the squared error may be wrong, on the squared scale.
 
-    wrong: float
-    refused: str | None
+    explained  the pilot's error on held-out episodes, which holds the floor and what the pilot misses
+    jump       how much of the floor's square may be a jump in the mean
+    shift      the part of it that stands out of chance, to be taken off
+    refused    why there can be no number     by_pilot: for any loss
+    """
 
-
-def _doubt(delta: np.ndarray, value: np.ndarray, estimate: float, jump: float) -> Doubt:
-    """How far extrapolation is to be believed: how much it takes away, how straight the line is, whether the mean may jump."""
-    removed = 1.0 - estimate / value[0] if value[0] > 0 else 1.0
-    if removed > MOST_REMOVED:
-        return Doubt(0.0, TOO_FAR.format(100 * min(1.0, removed)))
-    if jump > CURVED * estimate:
-        return Doubt(0.0, A_JUMP.format(f"{100 * jump / estimate:.0f} %" if jump < estimate else "all"))
-    bent = abs(float(_line(delta[:FEWER], value[:FEWER])[0] @ value[:FEWER]) - estimate)
-    return Doubt(max(bent, SHARE_IN_DOUBT * abs(value[0] - estimate)), None)
+    explained: float = 0.0
+    jump: float = 0.0
+    shift: float = 0.0
+    refused: str | None = None
+    by_pilot: bool = False
 
 
-def _jump(delta: np.ndarray, columns: np.ndarray) -> float:
-    """How much of an estimate may be a jump in the mean of one action column rather than disagreement.
+def _doubt(states: States, pilot: Pilot, pairs: Pairs, apart: np.ndarray, recorded: np.ndarray, jump: Sum) -> Doubt:
+    """Whether what the pilot leaves is disagreement: how good it is, how small the rest, whether the mean may jump.
+
+    `apart` and `recorded` [M, K] are half the mean squared differences with and without the pilot.
+    """
+    estimate = _intercept(pairs, apart).value
+    deviation = float(np.sqrt(states.actions.var(axis=0).mean()))
+    if estimate < (SMALLEST * deviation) ** 2:
+        return Doubt(refused=TOO_SMALL.format(100 * SMALLEST), by_pilot=True)
+    explained = float(pilot.error[~states.circular].sum() / states.actions.shape[1])
+    if (1 - MOST_EXPLAINED) * explained > estimate:
+        return Doubt(refused=NOT_EXPLAINED.format(explained / estimate), by_pilot=True)
+    plain = _intercept(pairs, recorded)
+    if MOST_KEPT * estimate > plain.value + t_quantile(0.975, pairs.df) * plain.error:
+        return Doubt(refused=ADDED, by_pilot=True)
+    if jump.value > JUMPY * estimate:
+        return Doubt(refused=A_JUMP.format(min(100.0, 100 * jump.value / estimate)))
+    if jump.value > SURE_OF_JUMP * jump.error:
+        return Doubt(jump=jump.value, shift=jump.value)  # what the pilot misses is put down to the jump
+    return Doubt(explained, max(0.0, jump.value))
+
+
+def _jump(states: States, pilot: Pilot, found: Neighbours, horizon: int) -> Sum:
+    """How much of the floor's square may be a jump in the mean of one action column rather than disagreement.
 
     Where a mean is smooth, values grow with the squared distance. Where it jumps (a gripper that closes), they grow with the
-    distance itself, and a straight line in its square ends too high. Both laws are fitted, to all columns together and to each
-    alone: where neither can be told from the other, the difference of their intercepts in that column is in doubt.
+    distance itself, and a straight line in its square ends too high, by once or twice what the two laws' intercepts lie
+    apart. The pilot takes smooth growth away, so what grows still is suspect.
     """
-    together, _ = _two_laws(delta, columns.sum(axis=1))
-    if together > TOLD_APART_TOGETHER:
-        return 0.0
-    each = [_two_laws(delta, value) for value in columns.T]
-    return max([0.0, *(between for misfits, between in each if misfits < TOLD_APART)])
-
-
-def _two_laws(delta: np.ndarray, value: np.ndarray) -> tuple[float, float]:
-    """How many times worse a line in the distance fits than one in its square, and how far their intercepts lie apart."""
-    smooth, _, misfit = _line(delta, value)
-    rooted, _, misfit_rooted = _line(np.sqrt(delta), value)
-    return misfit_rooted / max(misfit, 1e-30), float((smooth - rooted) @ value)
+    pairs, difference = _pairs(states, found), _differences(states, pilot, found, horizon)
+    there = pairs.curve[np.isfinite(pairs.curve)]  # far ahead, fewer episodes than that have an action
+    weights = np.pad(_line(there) - _line(np.sqrt(there)), (0, len(pairs.curve) - len(there)))
+    columns = [
+        _contrast(pairs, 0.5 * apart**2 / difference.shape[2], weights) for apart in np.moveaxis(difference, 2, 0)
+    ]
+    return max(columns, key=lambda column: column.value)
 
 
 def _root(squared: float) -> float:

@@ -46,6 +46,8 @@ SMALLEST_SIDE = 0.1
 """The mass that the density needs on either side of the dip."""
 LEAST_SHARE, LEAST_DISAGREEMENT = 0.05, 0.5
 """What the share of states with a dip, and the disagreement there, must be above, interval and all."""
+FULL_DISAGREEMENT = 0.95
+"""What the interval of the disagreement must reach: near a jump neighbours disagree half as often as a mixture expects."""
 MOST_ASKED = 2000
 """States with a dip, evenly taken, whose neighbours are looked for."""
 GRID = 33
@@ -63,7 +65,8 @@ class ModesEvidence:
     disagreement  at those states: neighbours on two sides of the dip, as a share of those that the mixture expects; 1 where
                   the mixture is right, near 0 where a jump in the mean is what it could not resolve
     interval …    95 %, over episodes, given the folds; None where fewer than five have such states
-    found         all four stand out: gain and dip above 0, share above 0.05, disagreement above 0.5; None where refused
+    found         all four stand out: gain and dip above 0, share above 0.05, disagreement above 0.5 and not below 0.95;
+                  None where refused
     """
 
     observations: str
@@ -496,6 +499,7 @@ def _judge(states: _States, inputs: np.ndarray, fits: Sequence[_Fit], h: int, ho
     ]
     least = (0.0, LEAST_SHARE, 0.0, LEAST_DISAGREEMENT)
     stands_out = [i is not None and i[0] > x for (_, i), x in zip(evidence, least, strict=True)]
+    stands_out[3] = stands_out[3] and evidence[3][1][1] >= FULL_DISAGREEMENT
     words = _words(name, horizon, stands_out, evidence[0][0], evidence[1][0])
     return ModesEvidence(name, horizon, *chain.from_iterable(evidence), all(stands_out), words, None)
 

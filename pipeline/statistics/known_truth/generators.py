@@ -235,9 +235,13 @@ def _turned(states: States) -> np.ndarray:
     return np.column_stack([np.sin(angle) + 0.5 * x, np.cos(angle) * (1 + 0.3 * y), 0.5 * np.sin(2 * angle) + 0.3 * y])
 
 
-def _gripping(states: States) -> np.ndarray:
-    """Two smooth columns, and a gripper that closes where the first coordinate is positive."""
-    return np.column_stack([_smooth(3, 2)(states), np.where(states.values[:, 0] > 0, 1.0, -1.0)])
+def _gripping(opening: float) -> Callable[[States], np.ndarray]:
+    """Two smooth columns, and a gripper that closes by `opening` where the first coordinate is positive."""
+
+    def mean(states: States) -> np.ndarray:
+        return np.column_stack([_smooth(3, 2)(states), np.where(states.values[:, 0] > 0, opening / 2, -opening / 2)])
+
+    return mean
 
 
 # How it varies --------------------------------------------------------------------------------------------------------
@@ -476,6 +480,8 @@ def _make() -> dict[str, Generator]:
                   _independent(_gaussian(_ARM), float((_ARM**2).mean())), {"state": 6}),
         Generator("fine_hand", "six joints and little noise: most of what neighbours differ by is where they are",
                   _task(6, latent=3), _smooth(6, 6), even(6, 0.12), {"state": 6}),
+        Generator("steady_hand", "six joints and hardly any noise", _task(6, latent=3), _smooth(6, 6), even(6, 0.03),
+                  {"state": 6}),
         Generator("two_arms", "eighteen joints", _task(18, latent=3), _smooth(18, 14), even(14, 0.3), {"state": 18}),
         Generator("coin", "at every frame one of two ways, 7 to 3", _task(3), _smooth(3, 2),
                   _independent(_coin, 0.17 * 0.84 + 0.15**2), {"state": 3}, modes=("state",)),
@@ -490,7 +496,9 @@ def _make() -> dict[str, Generator]:
                   _reacting(6, 0.3, 0.9), {"state": 6}),
         Generator("uneven", "noise up to three times as wide in some places", _task(2), _smooth(2, 2), _uneven(2),
                   {"state": 2}),
-        Generator("gripper", "a gripper that opens and closes at once", _task(3), _gripping, even(3, 0.2),
+        Generator("gripper", "a gripper that opens and closes at once", _task(3), _gripping(2.0), even(3, 0.2),
+                  {"state": 3}, smooth=False),
+        Generator("soft_gripper", "a gripper that opens and closes half as far", _task(3), _gripping(1.0), even(3, 0.2),
                   {"state": 3}, smooth=False),
         Generator("turning", "an angle that wraps", _turning, _turned, even(3, 0.3), {"state": 4}, circular=(2,)),
         Generator("rounded", "actions in whole steps", _task(4, latent=3), _smooth(4, 1), _rounded(_smooth(4, 1)),
@@ -501,7 +509,11 @@ def _make() -> dict[str, Generator]:
         Generator("two_ways_round", "the way of going, which two frames tell and one does not", _rounds, _smooth(2, 2),
                   _told(np.array([0.5, 0.5]), 0.2, 1.0, "state", "motion"), {"state": 2, "motion": 4},
                   sets=_WITH_MOTION, history=2, modes=("state",)),
+        Generator("winding", "what is done changes quickly from place to place", _task(3), _smooth(3, 2, turn=4.0),
+                  even(2, 0.2), {"state": 3}),
         Generator("exact", "no noise at all", _task(3), _smooth(3, 2), _NONE, {"state": 3}, positive_floor=False),
+        Generator("exact_winding", "no noise, and what is done changes quickly", _task(3), _smooth(3, 2, turn=4.0), _NONE,
+                  {"state": 3}, positive_floor=False),
     ]  # fmt: skip
     return {generator.name: generator for generator in made}
 
