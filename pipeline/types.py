@@ -300,7 +300,10 @@ class Rollouts:
     """Closed-loop results of one policy (seed 0 of fold 0) from numbered start states.
 
     start_states  [R] numbers       success [R] bool       best_reward [R] in 0 … 1       steps [R]
+    best_coverage [R] in 0 … 1, NaN where the simulator has none
     paths         [R, L, 2] where the end effector went (NaN after the end), for pictures; None where not two-dimensional
+    stages        [R, G] bool, which stages of the task each episode came to; None where the simulator has none
+    stage_names   [G], earliest first
     """
 
     simulator: str
@@ -313,3 +316,9 @@ class Rollouts:
     best_coverage: np.ndarray
     steps: np.ndarray
     paths: np.ndarray | None
+    stages: np.ndarray | None = None
+    stage_names: tuple[str, ...] = ()
+
+    def stage_counts(self) -> dict[str, int]:
+        """Stage → episodes that came to it; empty where there are none."""
+        return {} if self.stages is None else dict(zip(self.stage_names, self.stages.sum(axis=0).tolist(), strict=True))

@@ -8,7 +8,7 @@ A simulator is an optional extra of the package: its module can be imported with
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Protocol
 
@@ -20,11 +20,16 @@ from pipeline.types import Demonstrations, ObservationSet
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one step gave, environment by environment: reward [R] in 0 … 1, coverage [R] in 0 … 1, success [R] bool."""
+    """What one step gave, environment by environment: reward [R] in 0 … 1, success [R] bool.
+
+    coverage  [R] in 0 … 1, the share of the goal that is covered; NaN where a task has no such thing
+    stages    stage → [R] bool, whether the episode has come so far, each including those before; none where a task has none
+    """
 
     reward: np.ndarray
     coverage: np.ndarray
     success: np.ndarray
+    stages: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 class Environments(Protocol):
@@ -62,7 +67,10 @@ class Simulator(Protocol):
         """Environments at the numbered start states. The same number is the same state, always and everywhere."""
 
 
-SIMULATORS: dict[str, tuple[str, str]] = {"pusht": ("pipeline.simulate.pusht", "PushT")}
+SIMULATORS: dict[str, tuple[str, str]] = {
+    "pusht": ("pipeline.simulate.pusht", "PushT"),
+    "so101": ("pipeline.simulate.so101", "SO101"),
+}
 """Name → module and class. A module here imports no simulator before it is used."""
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.errors import NotApplicableError
 from pipeline.simulate import Outcome
+from pipeline.simulate.columns import misfit, misnumbered
 from pipeline.types import ACTION, STATE, Demonstrations, ObservationSet
 
 if TYPE_CHECKING:
@@ -166,32 +167,17 @@ class PushT:
         return PushTEnvironments(numbers)
 
     def fits(self, demos: Demonstrations, observation_set: ObservationSet) -> str | None:
-        cannot = f"Policies of '{demos.name}' cannot be rolled out in PushT"
-        problem = _misfit(demos, ACTION, COLUMNS[STATE])
-        if problem:
-            return f"{cannot}: {problem}"
-        for key in observation_set.features:
-            if key not in COLUMNS:
-                known = " and ".join(f"{k} ({len(names)} columns)" for k, names in COLUMNS.items())
-                return (
-                    f"{cannot}: the observation set '{observation_set.name}' needs {key}, which the simulator does not "
-                    f"show. It shows {known}; name a set of these under [datasets.{demos.name}.observations]."
-                )
-            problem = _misfit(demos, key, COLUMNS[key])
-            if problem:
-                return f"{cannot}: {problem}"
-        return None
+        return misfit(demos, observation_set, "PushT", COLUMNS, lambda key: _problem(demos, key))
 
 
-def _misfit(demos: Demonstrations, key: str, expected: tuple[str, ...]) -> str | None:
+def _problem(demos: Demonstrations, key: str) -> str | None:
     """Why a feature is not what PushT calls by that key. A unit that is not known is judged by the size of the
     numbers."""
-    wanted = f"{len(expected)} columns ({', '.join(expected)})"
-    feature = demos.features.get(key)
-    if feature is None:
-        return f"the data set has no feature {key}; expected {wanted}."
-    if len(feature.names) != len(expected):
-        return f"{key} has {len(feature.names)} columns ({', '.join(feature.names[:6])}); expected {wanted}."
+    expected = COLUMNS[STATE if key == ACTION else key]
+    problem = misnumbered(demos, key, expected)
+    if problem:
+        return problem
+    feature = demos.features[key]
     units = tuple(name.rsplit("_", 1)[-1] for name in expected)
     for name, unit, want in zip(feature.names, feature.units, units, strict=True):
         if unit is not None and unit != want:

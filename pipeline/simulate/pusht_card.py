@@ -1,77 +1,12 @@
-"""The card of a recorded PushT data set: how it was made, in words and numbers that the recording itself produced.
+"""The card of a recorded PushT data set: how it was made, in words and numbers that the recording itself produced."""
 
-What belongs here: the record of a recording and its README. What does not: recording.
-"""
-
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
-
-import numpy as np
-
-
-class _Recorded(Protocol):
-    strategy: int
-    action: np.ndarray
-
-
-@dataclass(frozen=True)
-class Recording:
-    """How a data set came about. `frames_median` and the range are frames an episode; `interval` is Clopper–Pearson,
-    95 %."""
-
-    seed: int
-    episodes: int
-    frames: int
-    frames_shortest: int
-    frames_median: float
-    frames_longest: int
-    attempts: int
-    failures: int
-    interval: tuple[float, float]
-    episodes_by_strategy: tuple[int, int]
-    versions: Mapping[str, str]
-
-    @classmethod
-    def of(cls, kept: Sequence[_Recorded], *, seed: int, attempts: int, versions: Mapping[str, str]) -> "Recording":
-        from scipy.stats import binomtest
-
-        interval = binomtest(len(kept), attempts).proportion_ci(0.95, method="exact")
-        lengths = [len(demonstration.action) for demonstration in kept]
-        clockwise = sum(demonstration.strategy for demonstration in kept)
-        return cls(
-            seed=seed,
-            episodes=len(kept),
-            frames=sum(lengths),
-            frames_shortest=min(lengths),
-            frames_median=float(np.median(lengths)),
-            frames_longest=max(lengths),
-            attempts=attempts,
-            failures=attempts - len(kept),
-            interval=(round(float(interval.low), 4), round(float(interval.high), 4)),
-            episodes_by_strategy=(len(kept) - clockwise, clockwise),
-            versions=dict(versions),
-        )
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
+from pipeline.simulate.recording import Recording
 
 
 def card(recording: Recording) -> str:
     """README.md for the data set's folder."""
-    r = recording
-    rate = f"{r.episodes} of {r.attempts} = {r.episodes / r.attempts:.3f}"
-    interval = f"95 % interval {r.interval[0]:.3f} … {r.interval[1]:.3f} (Clopper–Pearson)"
-    left_out = f"{r.failures} failed attempt{'s were' if r.failures != 1 else ' was'} left out"
-    first = (1 + r.seed) << 32
-    return _CARD.format(
-        **r.as_dict(),
-        made_with=", ".join(f"{name} {version}" for name, version in r.versions.items()),
-        starts=f"n = {first:,} … {first + r.attempts - 1:,}",
-        success=f"{rate}, {interval}; {left_out}",
-        anticlockwise=r.episodes_by_strategy[0],
-        clockwise=r.episodes_by_strategy[1],
-    )
+    anticlockwise, clockwise = recording.episodes_by_strategy
+    return _CARD.format(**recording.as_dict(), **recording.words(), anticlockwise=anticlockwise, clockwise=clockwise)
 
 
 _CARD = """---

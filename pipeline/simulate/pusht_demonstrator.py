@@ -1,24 +1,16 @@
-"""The scripted demonstrator of PushT, and the recording of its demonstrations as a LeRobot data set.
+"""The scripted demonstrator of PushT: carrying pushes out with an unsteady hand, and what is recorded of it.
 
-What belongs here: carrying pushes out with an unsteady hand, keeping what succeeded, writing it down. What does not:
-choosing pushes (`pusht_planner`), the words of the card (`pusht_card`).
-
-Same seed, same demonstrations, whatever the number of processes: an attempt depends on its number only.
+What belongs here: demonstrating, and the columns of its data set. What does not: choosing pushes (`pusht_planner`), the words
+of the card (`pusht_card`), recording in general (`recording`).
 """
 
-import json
-import shutil
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import count
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import StoreError
-from pipeline.lerobot_format.write import write_dataset
+from pipeline.lerobot_format.write import FeatureArrays
 from pipeline.simulate.pusht import (
     BLOCK,
     COLUMNS,
@@ -34,8 +26,9 @@ from pipeline.simulate.pusht import (
     reward_of,
     versions,
 )
-from pipeline.simulate.pusht_card import Recording, card
+from pipeline.simulate.pusht_card import card
 from pipeline.simulate.pusht_planner import MARGIN_PX, Planner, state_of
+from pipeline.simulate.recording import Demonstrator, last_of, record
 from pipeline.types import ACTION, STATE
 
 TASK = "Push the T-shaped block onto its outline."
@@ -64,11 +57,6 @@ class Demonstration:
     block: np.ndarray
     action: np.ndarray
     coverage: np.ndarray
-
-
-def start_number(seed: int, attempt: int) -> int:
-    """The start state of an attempt: 2³² and above, where no roll-out begins."""
-    return ((1 + seed) << 32) + attempt
 
 
 def demonstrate(number: int) -> Demonstration | None:
@@ -117,85 +105,7 @@ class _Hand:
         return np.clip(reported, MARGIN_PX, TABLE_PX - MARGIN_PX).astype(np.float32)
 
 
-def record_pusht(
-    out: Path,
-    *,
-    episodes: int = 200,
-    seed: int = 0,
-    workers: int = 2,
-    on_episode: Callable[[int, int], None] | None = None,
-) -> None:
-    """Record demonstrations into a new folder `out`, with a card that says how they were made.
-
-    Attempts are made in order until `episodes` of them have succeeded; the others are left out and counted.
-
-    Args:
-        workers: processes; the demonstrations do not depend on it.
-        on_episode: called with (recorded, wanted) after every demonstration.
-
-    Raises:
-        NotApplicableError: gym-pusht is not installed.
-        StoreError: `out` exists, or cannot be written.
-    """
-    environment_class()
-    out = out.absolute()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise StoreError(f"{out} exists already and is not empty. Give another folder, or remove it first.")
-    kept: list[Demonstration] = []
-    attempts = _attempts(seed, workers)
-    tried = 0
-    while len(kept) < episodes:
-        demonstration = next(attempts)
-        tried += 1
-        if demonstration is not None:
-            kept.append(demonstration)
-            if on_episode:
-                on_episode(len(kept), episodes)
-    attempts.close()
-    _write(out, kept, Recording.of(kept, seed=seed, attempts=tried, versions=versions()))
-
-
-def _attempts(seed: int, workers: int) -> Iterator[Demonstration | None]:
-    """Attempts 0, 1, 2 … in order, a few ahead of what is asked for when there are several processes."""
-    numbers = (start_number(seed, attempt) for attempt in count())
-    if workers == 1:
-        yield from map(demonstrate, numbers)
-    # A forked process would inherit threads of whoever calls (torch, Dagster) in the middle of what they were doing.
-    executor = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-    try:
-        ahead: list[Future] = [executor.submit(demonstrate, next(numbers)) for _ in range(2 * workers)]
-        while True:
-            yield ahead.pop(0).result()
-            ahead.append(executor.submit(demonstrate, next(numbers)))
-    finally:
-        executor.shutdown(cancel_futures=True)
-
-
-def _write(out: Path, kept: list[Demonstration], recording: Recording) -> None:
-    """Data, card and `meta/recording.json` under a temporary name beside `out`, then renamed."""
-    draft = out.parent / f".{out.name}.recording"
-    shutil.rmtree(draft, ignore_errors=True)
-    try:
-        write_dataset(
-            draft,
-            fps=FPS,
-            features=features_of(kept),
-            episode_lengths=[len(demonstration.action) for demonstration in kept],
-            tasks=[TASK] * len(kept),
-            robot_type="pusht_pusher",
-        )
-        (draft / "README.md").write_text(card(recording), encoding="utf-8")
-        (draft / "meta" / "recording.json").write_text(json.dumps(recording.as_dict(), indent=2) + "\n")
-        if out.exists():
-            out.rmdir()
-        draft.rename(out)
-    except OSError as error:
-        raise StoreError(f"{out} cannot be written: {error.strerror or error}. Choose another folder.") from None
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
-
-
-def features_of(kept: list[Demonstration]) -> dict[str, tuple[tuple[str, ...] | None, np.ndarray, str]]:
+def features_of(kept: list[Demonstration]) -> dict[str, FeatureArrays]:
     """Feature key → names, [N, D] values, dtype, as the writer takes them. All but `strategy` have LeRobot's usual
     names."""
     lengths = [len(demonstration.action) for demonstration in kept]
@@ -207,6 +117,26 @@ def features_of(kept: list[Demonstration]) -> dict[str, tuple[tuple[str, ...] | 
         "next.coverage": (None, coverage[:, None], "float32"),
         "next.reward": (None, reward_of(coverage)[:, None], "float32"),
         "next.success": (None, (coverage > SUCCESS_COVERAGE)[:, None], "bool"),
-        "next.done": (None, np.concatenate([np.arange(n) == n - 1 for n in lengths])[:, None], "bool"),
+        "next.done": (None, last_of(lengths), "bool"),
         "strategy": (None, np.repeat([d.strategy for d in kept], lengths)[:, None], "int64"),
     }
+
+
+def _versions() -> dict[str, str]:
+    environment_class()
+    return versions()
+
+
+PUSHT = Demonstrator(demonstrate, features_of, card, _versions, FPS, TASK, "pusht_pusher")
+
+
+def record_pusht(
+    out: Path,
+    *,
+    episodes: int = 200,
+    seed: int = 0,
+    workers: int = 2,
+    on_episode: Callable[[int, int], None] | None = None,
+) -> None:
+    """Record PushT demonstrations into a new folder (see `recording.record`)."""
+    record(PUSHT, out, episodes=episodes, seed=seed, workers=workers, on_episode=on_episode)

@@ -58,12 +58,14 @@ def rollout(
             if on_frame:
                 on_frame(len(parts) * limit + frame, total)
         parts.append({key: value[: len(block)] for key, value in episode.results().items()})
+        stage_names = episode.stage_names
     return Rollouts(
         simulator=simulator.name,
         simulator_version=simulator.version(),
         policy=name,
         observations=observation_set.name,
         start_states=np.asarray(numbers, dtype=np.int64),
+        stage_names=stage_names,
         **_joined(parts),
     )
 
@@ -83,6 +85,7 @@ class _Episode:
         self.frame = 0
         self._success = np.zeros(rows, dtype=bool)
         self._best_reward, self._best_coverage = np.zeros(rows), np.zeros(rows)
+        self._stages: dict[str, np.ndarray] = {}
         self._steps = np.zeros(rows, dtype=np.int64)
         self._path = [self._where(self.running)]
 
@@ -124,13 +127,20 @@ class _Episode:
         self._seen = [*self._seen[1:], self._environments.observe()]
         self._best_reward = np.where(ran, np.maximum(self._best_reward, outcome.reward), self._best_reward)
         self._best_coverage = np.where(ran, np.maximum(self._best_coverage, outcome.coverage), self._best_coverage)
+        for stage, reached in outcome.stages.items():
+            self._stages[stage] = self._stages.get(stage, False) | (ran & reached)
         self._steps += ran
         self._success |= ran & outcome.success
         self.running = ran & ~outcome.success
         self._path.append(self._where(ran))
 
+    @property
+    def stage_names(self) -> tuple[str, ...]:
+        return tuple(self._stages)
+
     def results(self) -> dict[str, np.ndarray]:
-        return {
+        stages = {"stages": np.stack(list(self._stages.values()), axis=1)} if self._stages else {}
+        return stages | {
             "success": self._success,
             "best_reward": self._best_reward,
             "best_coverage": self._best_coverage,

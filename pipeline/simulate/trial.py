@@ -18,6 +18,7 @@ from pipeline.simulate.rollout import rollout
 from pipeline.types import Rollouts
 
 TEXTS = ("simulator", "simulator_version", "policy", "observations")
+STAGE_NAMES = "stage_names"
 
 
 def roll_out(task: PolicyTask, trained: Path, on_frame: Callable[[int, int], None] | None = None) -> Rollouts:
@@ -51,10 +52,12 @@ def save_rollouts(rollouts: Rollouts, folder: Path) -> None:
     """Arrays as safetensors, words as JSON."""
     from safetensors.numpy import save_file
 
-    arrays = {f.name: getattr(rollouts, f.name) for f in fields(rollouts) if f.name not in TEXTS}
+    arrays = {f.name: getattr(rollouts, f.name) for f in fields(rollouts) if f.name not in (*TEXTS, STAGE_NAMES)}
     present = {name: np.ascontiguousarray(array) for name, array in arrays.items() if array is not None}
     save_file(present, folder / "rollouts.safetensors")
-    (folder / "rollouts.json").write_text(json.dumps({name: getattr(rollouts, name) for name in TEXTS}))
+    words = {name: getattr(rollouts, name) for name in TEXTS}
+    words |= {STAGE_NAMES: rollouts.stage_names} if rollouts.stage_names else {}
+    (folder / "rollouts.json").write_text(json.dumps(words))
 
 
 def load_rollouts(folder: Path) -> Rollouts:
@@ -62,4 +65,5 @@ def load_rollouts(folder: Path) -> Rollouts:
     from safetensors.numpy import load_file
 
     arrays = load_file(folder / "rollouts.safetensors")
-    return Rollouts(**{"paths": None, **arrays, **json.loads((folder / "rollouts.json").read_text())})
+    words = json.loads((folder / "rollouts.json").read_text())
+    return Rollouts(**{"paths": None, **arrays, **words, STAGE_NAMES: tuple(words.get(STAGE_NAMES, ()))})

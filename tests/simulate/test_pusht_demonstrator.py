@@ -9,9 +9,10 @@ from pipeline.embedded import embedded_folder
 from pipeline.errors import StoreError
 from pipeline.lerobot_format.read import read_dataset
 from pipeline.simulate.pusht import BLOCK, versions
-from pipeline.simulate.pusht_card import Recording, card
-from pipeline.simulate.pusht_demonstrator import record_pusht, start_number
+from pipeline.simulate.pusht_card import card
+from pipeline.simulate.pusht_demonstrator import record_pusht
 from pipeline.simulate.pusht_planner import Planner, State
+from pipeline.simulate.recording import Recording, start_number
 from pipeline.types import ACTION, STATE
 
 EPISODES = 2

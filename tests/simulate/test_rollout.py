@@ -1,6 +1,6 @@
 """The loop between policy and simulator, on a made-up world with known answers and on PushT."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -114,6 +114,41 @@ def test_every_question_has_the_same_number_of_rows():
 def test_actions_are_clipped_to_the_action_space():
     results = rollout(Creeper(step=-5.0), Line(), SET, [0], name="creeper", history=1, max_steps=3)
     np.testing.assert_array_equal(results.paths[0, :, 0], [0, -1, -1, -1])
+
+
+class Walk(Line):
+    """A line with two stages: half-way, and there."""
+
+    def start(self, numbers):
+        points = super().start(numbers)
+        step = points.step
+
+        def staged(actions, running):
+            outcome = step(actions, running)
+            return replace(outcome, stages={"half": outcome.reward >= 0.5, "there": outcome.success})
+
+        points.step = staged
+        return points
+
+
+def test_stages_are_those_that_were_ever_reached():
+    """The last turns back once it was half-way."""
+
+    class Wanderer(Creeper):
+        def predict(self, observations):
+            chunk = super().predict(observations)
+            chunk[0, 3] = np.minimum(chunk[0, 3], 0.55) if len(self.asked) == 1 else -1
+            return chunk
+
+    results = rollout(Wanderer(step=0.02, chunk=8), Walk(), SET, [0, -50, 15, 49], name="w", history=1, batch=4)
+    assert results.stage_names == ("half", "there")
+    assert results.stages.tolist() == [[False, False], [False, False], [True, False], [True, False]]
+    further = rollout(Creeper(), Walk(), SET, [0, 50, -150], name="creeper", history=2, batch=2)
+    assert further.stages.tolist() == [[True, True], [True, True], [True, False]]
+    assert further.stage_counts() == {"half": 3, "there": 2}
+    plain = rollout(Creeper(), Line(), SET, [0], name="creeper", history=1)
+    assert plain.stages is None
+    assert plain.stage_counts() == {}
 
 
 def test_progress_is_told():
