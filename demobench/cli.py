@@ -392,6 +392,19 @@ def record_pusht(
     record_pusht(out, episodes, seed, workers)
 
 
+@record_app.command("so101", epilog="Example:\n\n    demobench record so101 my_so101 --episodes 200 --seed 1")
+def record_so101(
+    out: Annotated[Path, typer.Argument(help="The folder to write; it must not exist.")],
+    episodes: Annotated[int, typer.Option(min=1, help="Demonstrations to record.")] = 50,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same content.")] = 0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+) -> None:
+    """Record SO-101 pick-and-place demonstrations in simulation, by a scripted leader, as a LeRobot data set."""
+    from demobench.commands.record import record_so101
+
+    record_so101(out, episodes, seed, workers)
+
+
 def main() -> None:
     """Entry point: a user's mistake is one message and exit status 2; Ctrl-C is 130."""
     # People add --debug at the end of the line that failed, wherever the option belongs.

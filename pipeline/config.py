@@ -90,7 +90,7 @@ class ObservationConfig(Settings):
 
 class DatasetConfig(Settings):
     source: str
-    simulator: Literal["pusht"] | None = None
+    simulator: Literal["pusht", "so101"] | None = None
     budget: BudgetName | None = None
     kind: Literal["auto"] | ActionKind | dict[str, ActionKind] = "auto"
     circular: tuple[str, ...] | None = None
@@ -149,6 +149,22 @@ PUSHT_SIM = DatasetConfig(
     },
 )
 
+SO101_SIM = DatasetConfig(
+    source="embedded:so101_sim",
+    simulator="so101",
+    budget="quick",
+    kind="position",
+    circular=(),
+    units={
+        f"{joint}.pos": "deg" for joint in ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+    }
+    | {"gripper.pos": "%"},
+    observations={
+        "joints": ("observation.state",),
+        "pose": ("observation.state", "observation.environment_state"),
+    },
+)
+
 
 class Config(Settings):
     """The whole file. What a file leaves out has the defaults of the `demobench.toml` that ships with the project."""
@@ -156,7 +172,7 @@ class Config(Settings):
     store: StoreConfig = StoreConfig()
     tracking: TrackingConfig = TrackingConfig()
     benchmark: BenchmarkConfig = BenchmarkConfig()
-    datasets: dict[str, DatasetConfig] = {"pusht_sim": PUSHT_SIM}
+    datasets: dict[str, DatasetConfig] = {"pusht_sim": PUSHT_SIM, "so101_sim": SO101_SIM}
     policies: dict[str, PolicyConfig] = DEFAULT_POLICIES
     schedule: ScheduleConfig = ScheduleConfig()
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.errors import DatasetError, did_you_mean
 
-EMBEDDED = ("pusht_sim",)
+EMBEDDED = ("pusht_sim", "so101_sim")
 """Names, as in `embedded:pusht_sim`."""
 
 

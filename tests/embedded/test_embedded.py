@@ -1,4 +1,4 @@
-"""The embedded data set is what its card says, and its frames are what the simulator gives."""
+"""The embedded pusht_sim is what its card says, and its frames are what the simulator gives."""
 
 import json
 
@@ -9,8 +9,8 @@ from pipeline.embedded import EMBEDDED, embedded_folder
 from pipeline.errors import DatasetError
 from pipeline.lerobot_format.read import read_dataset
 from pipeline.simulate.pusht import BLOCK, PushT, advance, make_environment, pose_columns, versions
-from pipeline.simulate.pusht_card import Recording, card
-from pipeline.simulate.pusht_demonstrator import start_number
+from pipeline.simulate.pusht_card import card
+from pipeline.simulate.recording import Recording, start_number
 from pipeline.types import ACTION, STATE, ObservationSet
 
 
@@ -27,7 +27,7 @@ def recording():
 def test_an_unknown_name_gets_a_suggestion():
     with pytest.raises(DatasetError, match="Did you mean 'pusht_sim'"):
         embedded_folder("pusht")
-    assert EMBEDDED == ("pusht_sim",)
+    assert EMBEDDED == ("pusht_sim", "so101_sim")
 
 
 def test_it_is_small_and_reads_without_a_warning(demos):

@@ -1,0 +1,32 @@
+"""What the summary of a roll-out holds, with and without stages."""
+
+import json
+
+import numpy as np
+
+from assets_defs.policies import _of_task
+from pipeline.statistics.success import summarise_rollouts
+from pipeline.types import Rollouts
+
+
+def rolled(coverage: np.ndarray, **stages) -> Rollouts:
+    success = np.array([True, False])
+    return Rollouts(
+        "any", "1", "p", "pose", np.arange(2), success, np.array([1, 0.5]), coverage, np.array([9, 20]), None, **stages
+    )
+
+
+def test_a_task_with_a_coverage_keeps_it_and_has_no_stages():
+    rollouts = rolled(np.array([0.96, 0.5]))
+    summary = summarise_rollouts(rollouts)
+    assert _of_task(summary, rollouts) == summary
+    assert summary["best_coverage"] == 0.73
+
+
+def test_a_task_with_stages_counts_them():
+    stages = np.array([[True, True, True], [True, False, False]])
+    rollouts = rolled(np.full(2, np.nan), stages=stages, stage_names=("reached", "grasped", "placed"))
+    summary = _of_task(summarise_rollouts(rollouts), rollouts)
+    assert "best_coverage" not in summary
+    assert list(summary["stages"].items()) == [("reached", 2), ("grasped", 1), ("placed", 1)]
+    json.dumps(summary, allow_nan=False)
