@@ -224,9 +224,17 @@ def _best_driven(rows: Sequence[Row]) -> Sentence:
     n, rate, interval = most["rollouts"]["n"], most["rollouts"]["success"], most["rollouts"].get("success_interval")
     if rate == 0:
         none = f"In closed loop no policy succeeds from any of {n} start states; the highest score is that of "
-        return [none, *who(most), ": ", Strong(show(most["rollouts"]["score"])), "."]
+        return [none, *who(most), ": ", Strong(show(most["rollouts"]["score"])), ".", *_how_far(most)]
     percent = f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f} %)" if show_interval(interval) else ""
-    return ["In closed loop ", *who(most), " succeeds most often: ", Strong(f"{round(rate * n)} of {n}"), f"{percent}."]
+    often = Strong(f"{round(rate * n)} of {n}")
+    return ["In closed loop ", *who(most), " succeeds most often: ", often, f"{percent}.", *_how_far(most)]
+
+
+def _how_far(row: Row) -> Sentence:
+    """How many of its episodes came to each stage of the task; nothing where the task has none."""
+    stages = row["rollouts"].get("stages") or {}
+    counts = ", ".join(f"{stage} {count}" for stage, count in stages.items())
+    return [f" Of {row['rollouts']['n']} episodes: {counts}."] if counts else []
 
 
 # Floors ---------------------------------------------------------------------------------------------------------------

@@ -34,6 +34,14 @@ def test_the_answer_of_a_benchmark(table):
     assert Strong("better than hold-still") in answer(table)[0]
 
 
+@pytest.mark.parametrize("success", [0.06, 0.0])
+def test_where_a_task_has_stages_they_are_counted(table, success):
+    """Those of the policy that succeeds most often, or comes closest."""
+    stages = {"reached": 48, "grasped": 17, "placed": round(50 * success)}
+    next(row for row in table["policies"] if row["rollouts"])["rollouts"] |= {"success": success, "stages": stages}
+    assert said(table)[-1].endswith(f". Of 50 episodes: reached 48, grasped 17, placed {round(50 * success)}.")
+
+
 def test_nothing_is_called_better_without_a_test(table):
     table["comparisons"] = []
     for row in table["policies"]:
