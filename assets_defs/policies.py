@@ -282,12 +282,13 @@ def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcom
     in_range = bool(((results.best_reward >= 0) & (results.best_reward <= 1)).all())
     agree = bool((results.best_reward[results.success] >= 1).all())
     words = [f"{summary['successes']} of {summary['n']} succeeded, score {summary['score']:.3f}"]
-    words += [f"{stage} {count}" for stage, count in summary.get("stages", {}).items()]
+    words += [f"{stage} {count}" for stage, count in zip(results.stage_names, results.stage_counts, strict=True)]
     return Outcome({"rollouts": summary, "why_not": None}, {"sane": (in_range and agree, ", ".join(words))})
 
 
 def _of_task(summary: dict[str, Any], rollouts: Rollouts) -> dict[str, Any]:
     """A summary without a coverage where the task has none, and with a count for each stage where it has stages."""
     kept = {name: value for name, value in summary.items() if name != "best_coverage" or not math.isnan(value)}
-    stages = rollouts.stage_counts()
-    return kept | ({"stages": stages} if stages else {})
+    if not rollouts.stage_names:
+        return kept
+    return kept | {"stages": list(rollouts.stage_names), "stage_counts": rollouts.stage_counts}

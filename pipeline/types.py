@@ -319,6 +319,7 @@ class Rollouts:
     stages: np.ndarray | None = None
     stage_names: tuple[str, ...] = ()
 
-    def stage_counts(self) -> dict[str, int]:
-        """Stage → episodes that came to it; empty where there are none."""
-        return {} if self.stages is None else dict(zip(self.stage_names, self.stages.sum(axis=0).tolist(), strict=True))
+    @property
+    def stage_counts(self) -> list[int]:
+        """[G] how many episodes came to each stage; empty where there are none."""
+        return [] if self.stages is None else self.stages.sum(axis=0).tolist()

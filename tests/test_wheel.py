@@ -37,8 +37,9 @@ def installed(tmp_path_factory) -> Path:
 
 
 def test_it_inspects_and_benchmarks_in_an_empty_folder(installed, tmp_path):
-    facts = json.loads(run(installed / "demobench", "inspect", "pusht_sim", "--json", "-", cwd=tmp_path).stdout)
-    assert facts["episodes"] >= 150
+    for name, least in (("pusht_sim", 150), ("so101_sim", 50)):
+        facts = json.loads(run(installed / "demobench", "inspect", name, "--json", "-", cwd=tmp_path).stdout)
+        assert facts["episodes"] >= least
     words = ["run", "pusht_sim", "--policies", "mlp", "--chunks", "1", "--steps", "20", "--seeds", "1", "--json", "-"]
     out = run(installed / "demobench", *words, cwd=tmp_path, NO_COLOR="1")
     (found,) = json.loads(out.stdout)

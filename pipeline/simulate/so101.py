@@ -68,7 +68,6 @@ class World:
         self._mujoco, self._model = mujoco, model()
         self.data: MjData = mujoco.MjData(self._model)
         self._random = np.random.default_rng([DRAWS_SENSORS, number])
-        self._hand = self._model.site("gripperframe").id
         self._moving_jaw, self._fixed_jaw = (self._model.geom(f"{side}_jaw_pad").id for side in ("moving", "fixed"))
         self._put(self.start)
         self._command = self.start.angles_rad

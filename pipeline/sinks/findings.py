@@ -232,9 +232,11 @@ def _best_driven(rows: Sequence[Row]) -> Sentence:
 
 def _how_far(row: Row) -> Sentence:
     """How many of its episodes came to each stage of the task; nothing where the task has none."""
-    stages = row["rollouts"].get("stages") or {}
-    counts = ", ".join(f"{stage} {count}" for stage, count in stages.items())
-    return [f" Of {row['rollouts']['n']} episodes: {counts}."] if counts else []
+    rollouts = row["rollouts"]
+    if not rollouts.get("stages"):
+        return []
+    counts = (f"{stage} {count}" for stage, count in zip(rollouts["stages"], rollouts["stage_counts"], strict=True))
+    return [f" Of {rollouts['n']} episodes: {', '.join(counts)}."]
 
 
 # Floors ---------------------------------------------------------------------------------------------------------------

@@ -145,10 +145,10 @@ def test_stages_are_those_that_were_ever_reached():
     assert results.stages.tolist() == [[False, False], [False, False], [True, False], [True, False]]
     further = rollout(Creeper(), Walk(), SET, [0, 50, -150], name="creeper", history=2, batch=2)
     assert further.stages.tolist() == [[True, True], [True, True], [True, False]]
-    assert further.stage_counts() == {"half": 3, "there": 2}
+    assert further.stage_counts == [3, 2]
     plain = rollout(Creeper(), Line(), SET, [0], name="creeper", history=1)
     assert plain.stages is None
-    assert plain.stage_counts() == {}
+    assert plain.stage_counts == []
 
 
 def test_progress_is_told():

@@ -35,7 +35,7 @@ def test_written_and_read_again(tmp_path, changes):
     read = load_rollouts(tmp_path)
     for f in fields(Rollouts):
         np.testing.assert_array_equal(getattr(read, f.name), getattr(written, f.name), err_msg=f.name)
-    assert read.stage_counts() == written.stage_counts()
+    assert read.stage_counts == written.stage_counts
 
 
 def test_a_simulator_without_stages_writes_nothing_of_them(tmp_path):
