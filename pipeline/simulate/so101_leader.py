@@ -68,10 +68,8 @@ def lead(
         strategy: 0 takes the side of the cube that needs the least roll of the wrist, 1 the next one.
     """
     way = _Way(start.angles_rad, hand, random, arm)
-    if not (
-        way.rest(int(random.integers(*hand.reaction_frames, endpoint=True)) / FPS, exactly=True)
-        and _task(way, start, strategy)
-    ):
+    way.rest(random.integers(*hand.reaction_frames, endpoint=True) / FPS, exactly=True)
+    if not _task(way, start, strategy):
         return None
     angles = np.array(way.angles)
     unsteady = np.array(list(_unsteadiness(len(angles), random))) * math.radians(hand.unsteady_deg)
