@@ -17,7 +17,7 @@ from pipeline.simulate.so101_card import card
 from pipeline.simulate.so101_demonstrator import demonstrate, record_so101
 from pipeline.simulate.so101_leader import SHUT_RAD, Hand, lead
 from pipeline.simulate.so101_world import model, start_of, versions
-from pipeline.types import ACTION, STATE
+from pipeline.types import ACTION, STATE, ColumnChoice
 
 EPISODES = 2
 STEADY = Hand((0, 0), (1.0, 1.0), 0.0, (0.0, 0.0), (0.0, 0.0), 0.0)
@@ -49,12 +49,11 @@ def test_the_embedded_data_can_be_recorded_again(recorded):
     made_with = json.loads((embedded / "meta/recording.json").read_text())["versions"]
     if made_with != versions():
         pytest.skip(f"recorded with {made_with}, installed are {versions()}: other physics, other demonstrations")
-    again, first = read_dataset(recorded, name="again"), read_dataset(embedded, name="so101_sim")
-    frames = slice(0, first.episode(EPISODES - 1).stop)
-    assert again.frames == frames.stop
-    assert set(again.columns) == set(first.columns)
+    later = ColumnChoice(exclude=tuple(range(EPISODES, 50)))
+    again, first = read_dataset(recorded, name="again"), read_dataset(embedded, name="so101_sim", choice=later)
     for key, values in again.columns.items():
-        np.testing.assert_array_equal(values, first.columns[key][frames], err_msg=key)
+        np.testing.assert_array_equal(values, first.columns[key], err_msg=key)
+    assert again.content_hash == first.content_hash
 
 
 def test_the_number_of_processes_changes_nothing(recorded, tmp_path):
