@@ -3,12 +3,10 @@
 Baselines go the same way as trained policies. An asset of a policy holds one entry for each observation set.
 """
 
-import math
 import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import dagster as dg
 
@@ -18,7 +16,6 @@ from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec,
 from assets_defs.show import picture, present, table
 from pipeline.experiment import Variant
 from pipeline.store import Made
-from pipeline.types import Rollouts
 
 TRAINED = """Weights of `{name}`: {what}
 
@@ -264,7 +261,7 @@ def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcom
     from pipeline.errors import NotApplicableError
     from pipeline.simulate.trial import roll_out, save_rollouts
     from pipeline.sinks import to_mlflow
-    from pipeline.statistics.success import summarise_rollouts
+    from pipeline.statistics.closed_loop import summarise_rollouts
 
     task, trained_unit = _task(bench, variant, unit), Unit(f"{variant.name}/trained_policy", unit.entry)
     name = f"{variant.name} {unit.entry} roll-outs"
@@ -277,18 +274,10 @@ def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcom
     except NotApplicableError as why:
         return Outcome({"rollouts": None, "why_not": str(why)}, {"sane": (True, str(why))})
     save_rollouts(results, draft)
-    summary = _of_task(summarise_rollouts(results), results)
+    summary = summarise_rollouts(results)
     to_mlflow.log_rollouts(tracking(bench), mlflow_run(bench, task, trained_unit), summary)
     in_range = bool(((results.best_reward >= 0) & (results.best_reward <= 1)).all())
     agree = bool((results.best_reward[results.success] >= 1).all())
     words = [f"{summary['successes']} of {summary['n']} succeeded, score {summary['score']:.3f}"]
     words += [f"{stage} {count}" for stage, count in zip(results.stage_names, results.stage_counts, strict=True)]
     return Outcome({"rollouts": summary, "why_not": None}, {"sane": (in_range and agree, ", ".join(words))})
-
-
-def _of_task(summary: dict[str, Any], rollouts: Rollouts) -> dict[str, Any]:
-    """A summary without a coverage where the task has none, and with a count for each stage where it has stages."""
-    kept = {name: value for name, value in summary.items() if name != "best_coverage" or not math.isnan(value)}
-    if not rollouts.stage_names:
-        return kept
-    return kept | {"stages": list(rollouts.stage_names), "stage_counts": rollouts.stage_counts}

@@ -17,7 +17,6 @@ import numpy as np
 
 from pipeline.statistics.comparisons import POWER, SURE, Word, holm, sign_flip
 from pipeline.statistics.trials import Trials
-from pipeline.types import Rollouts
 
 MOST_TRIALS = 1000
 """Beyond this a needed number of trials is "more than 1,000"."""
@@ -411,22 +410,3 @@ def describe_stages(trials: Trials) -> list[dict[str, Any]]:
             {"policy": policy, "trials": len(mine), "reached" if numbered else "ended_at": counts, "mean_stage": mean}
         )
     return found
-
-
-def summarise_rollouts(rollouts: Rollouts) -> dict[str, Any]:
-    """Closed-loop results of one model (JSON-able): `success` and `score` with what they rest on.
-
-    `score` is the mean over start states of the episode's best reward, min(1, coverage / 0.95); it is not a coverage.
-    """
-    n, successes = len(rollouts.success), int(rollouts.success.sum())
-    return {
-        "simulator": rollouts.simulator,
-        "simulator_version": rollouts.simulator_version,
-        "n": n,
-        "successes": successes,
-        "success": successes / n,
-        "success_interval": list(clopper_pearson(successes, n)),
-        "score": float(rollouts.best_reward.mean()),
-        "best_coverage": float(rollouts.best_coverage.mean()),
-        "median_steps": float(np.median(rollouts.steps)),
-    }

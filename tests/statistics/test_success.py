@@ -13,7 +13,6 @@ from scipy.stats import binom, boschloo_exact, fisher_exact
 from pipeline.statistics import success
 from pipeline.statistics.success import Count, clopper_pearson, compare_counts, compare_trials, mcnemar, wilson
 from pipeline.statistics.trials import Trials
-from pipeline.types import Rollouts
 
 
 def count(successes: int, trials: int, name: str | None = None) -> Count:
@@ -303,14 +302,3 @@ def test_named_stages_are_where_trials_ended():
     assert a == {"policy": "a", "trials": 2, "ended_at": {"placed": 1, "grasped": 1}, "mean_stage": None}
     assert b["ended_at"] == {"placed": 0, "grasped": 2}
     assert success.describe_stages(tried_once(a="11", b="01")) == []
-
-
-def test_rollouts_in_short():
-    rollouts = Rollouts(
-        simulator="pusht", simulator_version="1", policy="p", observations="pose", start_states=np.arange(4),
-        success=np.array([True, False, False, True]), best_reward=np.array([1.0, 0.5, 0.0, 1.0]),
-        best_coverage=np.array([0.97, 0.475, 0.0, 0.96]), steps=np.array([80, 300, 300, 120]), paths=None,
-    )  # fmt: skip
-    found = success.summarise_rollouts(rollouts)
-    assert (found["n"], found["successes"], found["success"], found["score"]) == (4, 2, 0.5, 0.625)
-    assert found["success_interval"] == pytest.approx(list(clopper_pearson(2, 4)))

@@ -31,6 +31,12 @@ MODES = (
 )  # fmt: skip
 """Where modes are looked for: networks are trained, so not everywhere."""
 
+ESTIMATORS = (
+    "brackets", "comparisons", "curve", "curve_errors", "floors", "intervals", "metrics", "modes", "neighbours", "pilot",
+    "radius", "success",
+)  # fmt: skip
+"""Modules of `pipeline.statistics` that records depend on."""
+
 Columns = dict[str, np.ndarray]
 
 
@@ -69,7 +75,8 @@ class Cell:
 def code_hash() -> str:
     """sha256 of everything that a record depends on: a change of an estimator makes its shards again."""
     statistics = Path(__file__).parents[1]
-    files = [*statistics.glob("*.py"), *(Path(__file__).parent / f"{name}.py" for name in ("generators", "studies"))]
+    files = [statistics / f"{name}.py" for name in ESTIMATORS]
+    files += [Path(__file__).parent / f"{name}.py" for name in ("generators", "studies")]
     files += [statistics.parent / f"{name}.py" for name in ("normalize", "split")]
     digest = hashlib.sha256(np.__version__.encode())
     for file in sorted(files):

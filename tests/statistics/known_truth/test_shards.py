@@ -1,6 +1,8 @@
 """Shards: each a pure function of its seeds, kept, joined, and not done twice."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -54,3 +56,13 @@ def test_a_plan_holds_every_study_once(size):
     assert {shard.study for shard in shards} == set(STUDIES)
     assert all(shard.count > 0 for shard in shards)
     assert all("/" not in shard.file_name and len(shard.file_name) < 200 for shard in shards)
+
+
+def test_the_hash_covers_every_estimator_that_a_study_reaches():
+    folder = Path(module.__file__).parents[1]
+    reached, waiting = set(), [folder / "known_truth" / f"{name}.py" for name in ("studies", "generators")]
+    while waiting:
+        found = set(re.findall(r"from pipeline\.statistics\.(\w+) import", waiting.pop().read_text())) - {"known_truth"}
+        waiting += [folder / f"{name}.py" for name in found - reached]
+        reached |= found
+    assert reached - {"trials"} == set(module.ESTIMATORS)  # trials read files; no study has one

@@ -1,0 +1,35 @@
+"""What roll-outs in a simulator say of a policy.
+
+What belongs here: summaries of `Rollouts`. What does not: rolling out (`simulate`), tests between success rates (`success`).
+"""
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.statistics.success import clopper_pearson
+from pipeline.types import Rollouts
+
+
+def summarise_rollouts(rollouts: Rollouts) -> dict[str, Any]:
+    """Closed-loop results of one model (JSON-able): `success` and `score` with what they rest on.
+
+    `score` is the mean over start states of the episode's best reward (PushT: min(1, coverage / 0.95)); it is not a
+    coverage. `best_coverage` is there where the task has one, `stages` and `stage_counts` where it has stages.
+    """
+    n, successes = len(rollouts.success), int(rollouts.success.sum())
+    summary = {
+        "simulator": rollouts.simulator,
+        "simulator_version": rollouts.simulator_version,
+        "n": n,
+        "successes": successes,
+        "success": successes / n,
+        "success_interval": list(clopper_pearson(successes, n)),
+        "score": float(rollouts.best_reward.mean()),
+        "median_steps": float(np.median(rollouts.steps)),
+    }
+    if not np.isnan(rollouts.best_coverage).any():
+        summary["best_coverage"] = float(rollouts.best_coverage.mean())
+    if rollouts.stage_names:
+        summary |= {"stages": list(rollouts.stage_names), "stage_counts": rollouts.stage_counts}
+    return summary
