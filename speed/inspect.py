@@ -32,7 +32,7 @@ except SystemExit as end:
 took = time.perf_counter() - began
 # Not ru_maxrss, which is inherited from the process that forked.
 peak = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
-print(json.dumps([took, int(peak.split()[1]) / 1024]))
+print(json.dumps([took, int(peak.split()[1]) * 1024 / 1e6]))
 """
 
 
@@ -60,7 +60,7 @@ def looked_at(demos: Demonstrations) -> Callable[[], object]:
 
 
 def of_command(demos: Demonstrations) -> tuple[float, float]:
-    """Seconds and peak resident MB of the command on a folder, imports left out of the seconds."""
+    """Seconds and peak resident MB (a million bytes) of the command on a folder, imports left out of the seconds."""
     with TemporaryDirectory() as place:
         folder, out = Path(place) / "set", Path(place) / "out.json"
         features = {key: (demos.features[key].names, demos.columns[key], "float32") for key in (ACTION, STATE)}
@@ -77,17 +77,19 @@ def measure() -> list[str]:
     small = made_arm(50, 0)
     large = many(small, -(-MILLION // small.frames))
     columns_mb = sum(values.nbytes for values in large.columns.values()) / 1e6
-    index_mb = 8 * 4 * large.frames / 1e6  # seconds, and the numbers of episode, frame and task
+    index_mb = 8 * 4 * large.frames / 1e6  # seconds, and the numbers of episode, frame and task, in the files
     small_s, small_mb = of_command(small)
     large_s, large_mb = of_command(large)
+    more_mb = large_mb - small_mb
     alone_s, beside_mb = seconds(looked_at(large)), peak_mb(looked_at(large))
     return [
         f"inspect, {small.episodes} episodes ({small.frames:,} frames, 12 columns): {small_s:.1f} s with reading, kinds and "
         f"detectors alone {min(seconds(looked_at(small)) for _ in range(3)):.2f} s",
         f"inspect, {large.episodes:,} episodes ({large.frames:,} frames): {large_s:.1f} s with reading, kinds and detectors alone "
-        f"{alone_s:.1f} s; beside the {columns_mb:.0f} MB of columns and {index_mb:.0f} MB of times and numbers that are read, "
-        f"these take {beside_mb:.0f} MB; the whole process peaks at {large_mb:.0f} MB, {large_mb - small_mb:.0f} more than for 50 "
-        "episodes",
+        f"{alone_s:.1f} s; the whole process peaks at {large_mb:.0f} MB, {more_mb:.0f} MB more than for {small.episodes} episodes: "
+        f"{more_mb / columns_mb:.2f} times the {columns_mb:.0f} MB of actions and states, {more_mb / (columns_mb + index_mb):.2f} "
+        f"times all columns that are read, which have {index_mb:.0f} MB of times and numbers besides; kinds and detectors take "
+        f"{beside_mb:.0f} MB of it",
     ]
 
 

@@ -12,15 +12,19 @@ import numpy as np
 
 from pipeline.inspection.finding import Finding
 from pipeline.inspection.survey import Survey
+from pipeline.lerobot_format.parts import blocks
 from pipeline.types import ACTION, STATE
 
 PROJECTIONS, ASKED, MOST = 4, 8, 64
-"""Numbers a frame is looked up by, frames asked of each episode, and neighbours looked at."""
+"""Numbers a frame is looked up by, frames asked of each episode, and neighbours looked at in one tree."""
 
 NEAR, NEAR_A_MILLION = 6e-3, 2e-3
 """How near counts, in spans: the more frames, the nearer, so that about as many lie within it (and take as long)."""
 
-BATCH = 4096
+IN_A_TREE = 2**17
+"""Frames of one tree: it takes 50 bytes a frame, so larger data sets are looked through a part at a time."""
+
+BATCH = 1024
 """Frames that are looked up at once; what is found for them takes a kilobyte a frame."""
 
 SAME, OVERLAP = 0.005, 0.6
@@ -54,17 +58,19 @@ def _candidates(survey: Survey, scales: Mapping[str, np.ndarray]) -> Counter:
     """(episode, other episode, shift) → how many of the frames asked met there; at least a quarter of them."""
     from scipy.spatial import cKDTree
 
-    points = _points(survey, scales)
-    if points is None or survey.demos.episodes < 2:
+    if survey.demos.episodes < 2 or not any(scale.any() for scale in scales.values()):
         return Counter()
-    asked = _asked(survey, points)
-    tree = cKDTree(points, balanced_tree=False)
-    reach, met = _reach(len(points)), Counter()
-    for first in range(0, len(asked), BATCH):
-        frames = asked[first : first + BATCH]
-        distances, found = tree.query(points[frames], k=min(MOST, len(points)), distance_upper_bound=reach)
-        for frame, near in zip(frames, np.where(np.isfinite(distances), found, -1), strict=True):
-            met.update(_meetings(survey.starts, int(frame), near[near >= 0]))
+    asked, where = _asked(survey, scales)
+    reach, met = _reach(survey.demos.frames), Counter()
+    for _, frames in blocks(survey.starts, IN_A_TREE):
+        points = _points(survey, scales, frames)
+        tree = cKDTree(points, balanced_tree=False)
+        for first in range(0, len(asked), BATCH):
+            some = slice(first, first + BATCH)
+            distances, found = tree.query(where[some], k=min(MOST, len(points)), distance_upper_bound=reach)
+            hits = np.isfinite(distances)
+            for row in np.flatnonzero(hits.any(axis=1)):
+                met.update(_meetings(survey.starts, int(asked[some][row]), frames.start + found[row][hits[row]]))
     return Counter({pair: count for pair, count in met.items() if count >= ASKED // 4})
 
 
@@ -86,15 +92,13 @@ def _pair(one: int, other: int, shift: int) -> tuple[int, int, int]:
     return (int(one), int(other), int(shift)) if one < other else (int(other), int(one), -int(shift))
 
 
-def _points(survey: Survey, scales: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """[N, PROJECTIONS]; float64, because a tree copies anything else."""
+def _points(survey: Survey, scales: Mapping[str, np.ndarray], frames: slice) -> np.ndarray:
+    """[frames, PROJECTIONS]; float64, because a tree copies anything else."""
     living = [(f, int(i)) for f in (ACTION, STATE) for i in np.flatnonzero(scales[f])]
-    if not living:
-        return None
     weights = np.random.default_rng(0).normal(size=(len(living), PROJECTIONS)) / np.sqrt(len(living))
-    points = np.zeros((survey.demos.frames, PROJECTIONS))
+    points = np.zeros((frames.stop - frames.start, PROJECTIONS))
     for (feature, i), weight in zip(living, weights, strict=True):
-        scaled = survey.demos.columns[feature][:, i] / np.float32(scales[feature][i])
+        scaled = survey.demos.columns[feature][frames, i] / np.float32(scales[feature][i])
         for number in range(PROJECTIONS):
             points[:, number] += np.float32(weight[number]) * scaled
     return points
@@ -107,16 +111,23 @@ def _scales(survey: Survey, feature: str) -> np.ndarray:
     return np.where(survey.dead[feature], 0.0, np.maximum(survey.spans[feature], whole / 4))
 
 
-def _asked(survey: Survey, points: np.ndarray) -> np.ndarray:
-    """Global frames to look up: in each of ASKED parts of an episode the one where it moves most; none where it rests."""
-    asked = []
-    for episode in range(survey.demos.episodes):
-        frames = survey.demos.episode(episode)
-        speed = np.abs(np.diff(points[frames], axis=0)).max(axis=1) if frames.stop - frames.start > 1 else np.zeros(0)
-        for part in np.array_split(np.arange(len(speed)), ASKED):
-            if len(part) and speed[part].max() > NEAR_A_MILLION:
-                asked.append(frames.start + int(part[np.argmax(speed[part])]))
-    return np.array(asked, np.int64)
+def _asked(survey: Survey, scales: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Global frames to look up, and their points: in each of ASKED parts of an episode the one where it moves most; none
+    where it rests.
+    """
+    asked, where = [], []
+    for episodes, block in blocks(survey.starts):
+        points = _points(survey, scales, block)
+        for episode in range(episodes.start, episodes.stop):
+            first = int(survey.starts[episode]) - block.start
+            mine = points[first : first + int(survey.demos.lengths[episode])]
+            speed = np.abs(np.diff(mine, axis=0)).max(axis=1) if len(mine) > 1 else np.zeros(0)
+            for part in np.array_split(np.arange(len(speed)), ASKED):
+                if len(part) and speed[part].max() > NEAR_A_MILLION:
+                    fastest = first + int(part[np.argmax(speed[part])])
+                    asked.append(block.start + fastest)
+                    where.append(points[fastest].copy())  # a view would keep all of them
+    return np.array(asked, np.int64), np.array(where).reshape(-1, PROJECTIONS)
 
 
 def _compare(survey: Survey, scales: Mapping[str, np.ndarray], one: int, other: int, shift: int) -> tuple[int, float]:

@@ -22,18 +22,18 @@ EPISODE_RATE = 0.2
 
 def check_clock(survey: Survey) -> Iterator[Finding]:
     demos = survey.demos
-    last = np.zeros(demos.frames, bool)
-    last[demos.episode_starts[1:] - 1] = True
-    seconds = np.diff(demos.timestamps, append=demos.timestamps[-1:])
-    inside = ~last
+    inside = np.ones(demos.frames - 1, bool)
+    inside[demos.episode_starts[1:-1] - 1] = False
+    seconds = np.diff(demos.timestamps)
     if not inside.any():
         return
-    usual = float(np.median(seconds[inside]))
+    usual = float(np.median(seconds[inside], overwrite_input=True))
     yield from _whole(survey, seconds, inside, usual)
     if usual <= 0:
         return
     for episode in range(demos.episodes):
-        yield from _episode(survey, episode, seconds[demos.episode(episode)][:-1], usual)
+        first, stop = demos.episode_starts[episode : episode + 2]
+        yield from _episode(survey, episode, seconds[first : stop - 1], usual)
 
 
 def _whole(survey: Survey, seconds: np.ndarray, inside: np.ndarray, usual: float) -> Iterator[Finding]:
@@ -46,13 +46,14 @@ def _whole(survey: Survey, seconds: np.ndarray, inside: np.ndarray, usual: float
             "Everything in seconds is wrong by that factor.",
         )  # fmt: skip
         return
-    off = inside & (np.abs(seconds - tick) > OFF * tick)
+    off = np.abs(seconds - tick) > OFF * tick
+    off &= inside
     share = float(off.sum() / inside.sum())
     if share > UNEVEN:
         lengths = survey.demos.lengths
-        counts = np.add.reduceat(off.astype(np.int64), survey.starts[:-1])
+        counts = np.add.reduceat(np.append(off, False), survey.starts[:-1], dtype=np.int64)
         worst = int(np.argmax(counts / lengths))
-        low, high = seconds[inside].min(), seconds[inside].max()
+        low, high = seconds.min(where=inside, initial=np.inf), seconds.max(where=inside, initial=-np.inf)
         yield Finding(
             "clock", None, "timestamp", share, UNEVEN,
             f"Uneven clock: a tick lasts {low:.3f} to {high:.3f} s where fps says {tick:.3f} s, and {share:.1%} of the ticks are "

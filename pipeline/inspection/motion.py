@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.inspection.finding import Finding
 from pipeline.inspection.survey import Column, Survey, robust
+from pipeline.lerobot_format.parts import parts
 from pipeline.types import ACTION, STATE
 
 IDLE_S, IDLE_SHARE = 2.0, 0.1
@@ -110,14 +111,18 @@ def _excess(survey: Survey, column: Column) -> np.ndarray:
 
     Where frames were lost, a step covers more time: it is divided by the ticks that it took, unless it is a rate.
     """
-    steps = np.abs(survey.steps(column))
-    if not column.is_rate:
-        ticks = np.diff(survey.demos.timestamps, append=survey.demos.timestamps[-1:]) / survey.tick
-        steps /= np.clip(np.nan_to_num(ticks, nan=1.0), 1.0, None).astype(np.float32)
+    steps, stamps = survey.steps(column), survey.demos.timestamps
+    np.abs(steps, out=steps)
     padded = np.pad(steps, 2)
-    around = np.stack([padded[:-4], padded[1:-3], padded[3:-1], padded[4:]])
-    around.sort(axis=0)
-    return steps - (around[1] + around[2]) / 2
+    inner = padded[2:-2]
+    for part in parts(len(steps) - 1) if not column.is_rate else ():
+        ticks = np.diff(stamps[part.start : part.stop + 1]) / survey.tick
+        inner[part] /= np.clip(np.nan_to_num(ticks, nan=1.0), 1.0, None).astype(np.float32)
+    for part in parts(len(steps)):
+        around = np.stack([padded[part.start + away : part.stop + away] for away in (0, 1, 3, 4)])
+        around.sort(axis=0)
+        steps[part] = inner[part] - (around[1] + around[2]) / 2
+    return steps
 
 
 def is_switch(column: Column) -> bool:

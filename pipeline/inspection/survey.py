@@ -10,7 +10,8 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.lerobot_format.kinds import state_column, steps_of, wrap
+from pipeline.lerobot_format.kinds import state_column, wrap
+from pipeline.lerobot_format.parts import blocks
 from pipeline.lerobot_format.quality import dead_columns
 from pipeline.types import ACTION, STATE, Demonstrations, Semantics
 
@@ -97,9 +98,8 @@ class Survey:
     @cached_property
     def partners(self) -> tuple[int | None, ...]:
         """[A] the state column that each action column commands; of steps, which `Semantics` leaves out, by name or place."""
-        steps = steps_of(self.demos) if "delta" in self.semantics.kinds else None
         return tuple(
-            state_column(self.demos, position, steps) if kind == "delta" and steps and known is None else known
+            state_column(self.demos, position) if kind == "delta" and known is None else known
             for position, (kind, known) in enumerate(
                 zip(self.semantics.kinds, self.semantics.state_column, strict=True)
             )
@@ -133,14 +133,15 @@ class Survey:
         """[E] frames before anything has left its first value by MOVED of its span, and frames after everything has
         come within MOVED of its last: the idle start and end. An episode in which nothing moves is idle throughout.
         """
-        lengths = self.demos.lengths
         left, arrived = np.zeros(self.demos.frames, bool), np.zeros(self.demos.frames, bool)
         for column in self.living(STATE, ACTION):
             if column.is_rate or column.span <= 0:
                 continue
             for mark, border in ((left, self.starts[:-1]), (arrived, self.starts[1:] - 1)):
-                away = column.values - np.repeat(column.values[border], lengths)
-                mark |= np.abs(wrap(away) if column.circular else away) > MOVED * column.span
+                for episodes, frames in blocks(self.starts):
+                    rest = np.repeat(column.values[border[episodes]], self.demos.lengths[episodes])
+                    away = column.values[frames] - rest
+                    mark[frames] |= np.abs(wrap(away) if column.circular else away) > MOVED * column.span
         return _first_true(left, self.starts), _first_true(arrived[::-1], self.demos.frames - self.starts[::-1])[::-1]
 
 
@@ -156,9 +157,11 @@ def _span(values: np.ndarray) -> float:
 
 def _first_true(mask: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """[E] frames before the first True of each episode; its length where there is none."""
-    lengths = np.diff(starts)
-    places = np.append(np.flatnonzero(mask), len(mask))
-    return np.minimum(places[np.searchsorted(places, starts[:-1])] - starts[:-1], lengths)
+    found = []
+    for episodes, frames in blocks(starts):
+        places, begins = np.append(np.flatnonzero(mask[frames]), len(mask)), starts[:-1][episodes] - frames.start
+        found.append(places[np.searchsorted(places, begins)] - begins)
+    return np.minimum(np.concatenate(found), np.diff(starts))
 
 
 def runs(mask: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,7 +175,12 @@ def runs(mask: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def per_episode(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """[E] sums over the frames of each episode."""
-    return np.add.reduceat(values, starts[:-1], dtype=np.float64)
+    return np.concatenate(
+        [
+            np.add.reduceat(values[frames], starts[:-1][episodes] - frames.start, dtype=np.float64)
+            for episodes, frames in blocks(starts)
+        ]
+    )
 
 
 def robust(values: np.ndarray) -> tuple[float, float]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.inspection.finding import Finding
 from pipeline.inspection.survey import Column, Survey, per_episode, robust
+from pipeline.lerobot_format.parts import blocks
 from pipeline.types import ACTION, STATE
 
 EARLY, LATE_S, LONGEST = 10, 1.0, 40
@@ -81,7 +82,7 @@ def _follow(survey: Survey, command: Column, state: Column) -> Following:
     if command.kind == "position" and not command.circular:
         gap = per_episode(np.abs(command.values - state.values), survey.starts) / survey.demos.lengths
     return Following(
-        replace(command, values=command.values[:0]),
+        replace(command, values=np.empty(0, np.float32)),  # a view would keep them all
         float(whole[0]) if correlation[0] >= DOES_NOT else float("nan"), float(correlation[0]),
         np.where(moves, own, np.nan), np.where(moves, correlations, np.nan), correlations - usual, gap,
     )  # fmt: skip
@@ -92,16 +93,18 @@ def _correlate(survey: Survey, told: np.ndarray, done: np.ndarray) -> tuple[np.n
     late = int(min(LONGEST, survey.frames(LATE_S, least=3), survey.demos.lengths.max()))
     lags = np.arange(-EARLY, late + 1)
     table = np.empty((len(lags), survey.demos.episodes))
-    frames = np.arange(survey.demos.frames, dtype=np.int32)
-    left = np.repeat(survey.starts[1:].astype(np.int32), survey.demos.lengths) - frames  # to the end of the episode
-    for row, lag in enumerate(lags):
-        one, other = (told, done) if lag >= 0 else (done, told)
-        shift = abs(int(lag))
-        product = np.zeros_like(told)
-        if shift < len(told):
-            np.multiply(one[: len(one) - shift], other[shift:], out=product[: len(one) - shift])
-        product[left <= shift] = 0
-        table[row] = per_episode(product, survey.starts)
+    for episodes, frames in blocks(survey.starts):
+        ends = np.repeat(survey.starts[1:][episodes], survey.demos.lengths[episodes])
+        left = ends - np.arange(frames.start, frames.stop)  # to the end of the episode
+        begins = survey.starts[:-1][episodes] - frames.start
+        for row, lag in enumerate(lags):
+            one, other = (told[frames], done[frames]) if lag >= 0 else (done[frames], told[frames])
+            shift = abs(int(lag))
+            product = np.zeros_like(one)
+            if shift < len(one):
+                np.multiply(one[: len(one) - shift], other[shift:], out=product[: len(one) - shift])
+            product[left <= shift] = 0
+            table[row, episodes] = np.add.reduceat(product, begins, dtype=np.float64)
     return lags, table
 
 

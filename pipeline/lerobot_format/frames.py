@@ -28,8 +28,8 @@ class Frames:
     """All rows in the order of the files.
 
     columns      feature key → [N, D] float32
-    file_of      [N] int64, the position of each frame's file in `Layout.files`
-    episode_id, frame_index, task_index   [N] int64, or None where no file has the column
+    file_of      [N] int32, the position of each frame's file in `Layout.files`
+    episode_id, frame_index, task_index   [N] int32 (int64 where that is too small), or None where no file has the column
     timestamps   [N] float64 s, or None
     """
 
@@ -51,7 +51,7 @@ class _Survey:
     notes: list[str]
 
 
-_INDEX = {"episode_index": np.int64, "frame_index": np.int64, "task_index": np.int64, "timestamp": np.float64}
+_INDEX = {"episode_index": np.int32, "frame_index": np.int32, "task_index": np.int32, "timestamp": np.float64}
 
 
 def read_frames(layout: Layout) -> Frames:
@@ -60,6 +60,8 @@ def read_frames(layout: Layout) -> Frames:
     Raises:
         DatasetError: a file is missing or damaged, a column is missing, has another shape, or does not fit into memory.
     """
+    import pyarrow as pa
+
     survey = _survey(layout)
     total = sum(survey.rows)
     features = {key: feature for key, feature in layout.features.items() if key in survey.shared}
@@ -76,22 +78,29 @@ def read_frames(layout: Layout) -> Frames:
                     values = _numbers(layout, file, batch.column(key), key, target.shape[1])
                     if key in columns and _is_rounded_by_float32(values):
                         large.add(key)
+                    if target.dtype == np.int32 and not _fits_int32(values):
+                        target = index[key] = target.astype(np.int64)
                     with np.errstate(over="ignore", invalid="ignore"):  # what comes out is checked for being finite
                         target[rows] = values
                 row = rows.stop
+    pa.default_memory_pool().release_unused()
     index = {key: values[:, 0] for key, values in index.items()}
     rounded = [
         f"Feature '{key}' holds whole numbers too large for float32; they were rounded." for key in sorted(large)
     ]
     return Frames(
         columns=columns,
-        file_of=np.repeat(np.arange(len(survey.rows)), survey.rows),
+        file_of=np.repeat(np.arange(len(survey.rows), dtype=np.int32), survey.rows),
         episode_id=index.get("episode_index"),
         frame_index=index.get("frame_index"),
         task_index=index.get("task_index"),
         timestamps=index.get("timestamp"),
         warnings=(*survey.notes, *rounded),
     )
+
+
+def _fits_int32(values: np.ndarray) -> bool:
+    return not (values.max() >= 2**31 or values.min() < -(2**31))
 
 
 def _is_rounded_by_float32(values: np.ndarray) -> bool:

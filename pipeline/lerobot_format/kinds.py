@@ -8,11 +8,12 @@ when the action really is what it seems. What does not belong here: what the use
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.lerobot_format.parts import parts
 from pipeline.types import ACTION, STATE, ActionKind, Demonstrations
 
 CLEAR, MARGIN, CERTAIN = 0.5, 0.2, 0.9
@@ -58,13 +59,17 @@ class Steps:
     seconds: np.ndarray
 
 
-def steps_of(demonstrations: Demonstrations) -> Steps:
-    """All pairs of consecutive frames within episodes; where the clock stands still, 1 / fps stands for the time."""
-    inside = np.ones(demonstrations.frames, bool)
-    inside[demonstrations.episode_starts[1:] - 1] = False
-    first = np.flatnonzero(inside)
-    seconds = demonstrations.timestamps[first + 1] - demonstrations.timestamps[first]
-    return Steps(first, np.where(seconds > 0, seconds, 1 / demonstrations.fps))
+def steps_of(demonstrations: Demonstrations) -> Iterator[Steps]:
+    """All pairs of consecutive frames within episodes, a part at a time; where the clock stands still, 1 / fps stands for
+    the time.
+    """
+    last, stamps = demonstrations.episode_starts[1:] - 1, demonstrations.timestamps
+    for part in parts(demonstrations.frames):
+        inside = np.ones(part.stop - part.start, bool)
+        inside[last[np.searchsorted(last, part.start) : np.searchsorted(last, part.stop)] - part.start] = False
+        first = part.start + np.flatnonzero(inside)
+        seconds = stamps[first + 1] - stamps[first]
+        yield Steps(first, np.where(seconds > 0, seconds, 1 / demonstrations.fps))
 
 
 def wrap(angle: np.ndarray) -> np.ndarray:
@@ -78,11 +83,11 @@ def guess_kinds(
     """One guess for each action column. `still` [A] marks columns that hardly move: they follow their name, else the
     kind that most other columns have.
     """
-    feature, steps = demonstrations.features[ACTION], steps_of(demonstrations)
-    states = [state_column(demonstrations, column, steps) for column in range(len(feature.names))]
+    feature = demonstrations.features[ACTION]
+    states = [state_column(demonstrations, column) for column in range(len(feature.names))]
     guesses: list[Guess | None] = []
     for column, (name, unit, state) in enumerate(zip(feature.names, feature.units, states, strict=True)):
-        scores = None if still[column] else _scores(demonstrations, column, state, steps, circular)
+        scores = None if still[column] else _scores(demonstrations, column, state, circular)
         guesses.append(_judge(name, unit, state, scores))
     agreed = Counter(guess.kind for guess in guesses if guess and guess.kind != "other" and not guess.doubt)
     usual = agreed.most_common(1)[0][0] if agreed else None
@@ -95,7 +100,7 @@ def _by_the_others(usual: ActionKind | None, state: int | None) -> Guess:
     return Guess("other", None, "it does not move, and neither its name nor the other columns tell")
 
 
-def state_column(demonstrations: Demonstrations, column: int, steps: Steps) -> int | None:
+def state_column(demonstrations: Demonstrations, column: int) -> int | None:
     """The column of `observation.state` that an action column speaks of: by name, by place, or by values.
 
     By place only where no names agree and there are as many of both. By values means that the next state explains nine
@@ -111,14 +116,16 @@ def state_column(demonstrations: Demonstrations, column: int, steps: Steps) -> i
     named = {_stem(state) for state in states} & {_stem(name) for name in names}
     if len(names) == len(states) and not named:
         return column
-    action = demonstrations.columns[ACTION][steps.first, column].astype(np.float64)
-    following = demonstrations.columns[STATE][steps.first + 1].astype(np.float64)
     taken = {_stem(name) for name in names}
-    shares = [
-        _explained(action, following[:, j]) if _stem(states[j]) not in taken else -1.0 for j in range(len(states))
-    ]
+    free = [j for j, state in enumerate(states) if _stem(state) not in taken]
+
+    def differences(steps: Steps, action: np.ndarray) -> list[np.ndarray]:
+        following = demonstrations.columns[STATE][steps.first + 1]
+        return [action - following[:, j] for j in free]
+
+    shares = _explained(demonstrations, column, differences) if free else None
     best = int(np.argmax(shares)) if shares else 0
-    return best if shares and shares[best] >= CERTAIN else None
+    return free[best] if shares and shares[best] >= CERTAIN else None
 
 
 def _stem(name: str) -> tuple[str, ...]:
@@ -138,38 +145,45 @@ def _hint(name: str, unit: str | None) -> ActionKind | None:
 
 
 def _scores(
-    demonstrations: Demonstrations,
-    column: int,
-    state: int | None,
-    steps: Steps,
-    circular: Mapping[str, tuple[bool, ...]],
+    demonstrations: Demonstrations, column: int, state: int | None, circular: Mapping[str, tuple[bool, ...]]
 ) -> dict[ActionKind, float] | None:
     """Share of the action's variance that each kind explains; empty where no state column goes with it, None where the
     action is constant.
     """
-    action = demonstrations.columns[ACTION][steps.first, column].astype(np.float64)
-    if not len(action) or action.std() == 0:
+    turns = state is not None and circular[STATE][state]
+
+    def differences(steps: Steps, action: np.ndarray) -> list[np.ndarray]:
+        if state is None:
+            return []
+        values = demonstrations.columns[STATE][:, state]
+        now, following = values[steps.first].astype(np.float64), values[steps.first + 1].astype(np.float64)
+        change = wrap(following - now) if turns else following - now
+        away = wrap(action - following) if turns else action - following
+        return [away, action - change / steps.seconds, action - change]
+
+    shares = _explained(demonstrations, column, differences)
+    return None if shares is None else dict(zip(("position", "velocity", "delta"), shares, strict=False))
+
+
+def _explained(
+    demonstrations: Demonstrations, column: int, differences: Callable[[Steps, np.ndarray], list[np.ndarray]]
+) -> list[float] | None:
+    """1 − mean squared difference / variance of the action, for each prediction; 1 is perfect, 0 is what the mean alone
+    does, below 0 is worse. None where the action is constant.
+    """
+    values = demonstrations.columns[ACTION][:, column]
+    taken = [values[steps.first] for steps in steps_of(demonstrations)]
+    count = sum(map(len, taken))
+    if not count or min(part.min() for part in taken if len(part)) == max(part.max() for part in taken if len(part)):
         return None
-    if state is None:
-        return {}
-    now = demonstrations.columns[STATE][steps.first, state].astype(np.float64)
-    following = demonstrations.columns[STATE][steps.first + 1, state].astype(np.float64)
-    turns = circular[STATE][state]
-    change = wrap(following - now) if turns else following - now
-    return {
-        "position": _explained(action, following, turns),
-        "velocity": _explained(action, change / steps.seconds),
-        "delta": _explained(action, change),
-    }
-
-
-def _explained(action: np.ndarray, prediction: np.ndarray, turns: bool = False) -> float:
-    """1 − mean squared error / variance; 1 is perfect, 0 is what the mean alone does, below 0 is worse."""
-    variance = action.var()
-    if not len(action) or variance == 0:
-        return -math.inf
-    error = wrap(action - prediction) if turns else action - prediction
-    return float(1 - np.mean(error**2) / variance)
+    mean = sum(float(part.sum(dtype=np.float64)) for part in taken) / count
+    spread, errors = 0.0, np.zeros(0)
+    for steps, part in zip(steps_of(demonstrations), taken, strict=True):
+        action = part.astype(np.float64)
+        spread += float(((action - mean) ** 2).sum())
+        squares = np.array([float((one**2).sum()) for one in differences(steps, action)])
+        errors = squares if not len(errors) else errors + squares
+    return (1 - errors / spread).tolist()
 
 
 def _judge(name: str, unit: str | None, state: int | None, scores: dict[ActionKind, float] | None) -> Guess | None:

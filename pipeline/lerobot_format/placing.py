@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.errors import DatasetError
 from pipeline.lerobot_format.frames import Frames
 from pipeline.lerobot_format.layout import Layout
+from pipeline.lerobot_format.parts import blocks, parts
 
 MOST_NAMED = 10
 
@@ -42,8 +43,7 @@ def place_frames(layout: Layout, frames: Frames) -> Places:
     """
     owner, notes = _owners(layout, frames)
     ids = np.array([entry.id for entry in layout.episodes], np.int64)
-    position = np.minimum(np.searchsorted(ids, owner), len(ids) - 1)
-    position[ids[position] != owner] = -1
+    position = _positions(ids, owner)
     rows = None
     if (position < 0).any() or (np.diff(position) < 0).any():
         kept = np.flatnonzero(position >= 0)
@@ -57,6 +57,15 @@ def place_frames(layout: Layout, frames: Frames) -> Places:
         _check_lengths(layout, frames, counts)
         return Places(rows, starts, tuple(notes))
     return _by_frame_index(layout, frames, rows, starts, notes)
+
+
+def _positions(ids: np.ndarray, owner: np.ndarray) -> np.ndarray:
+    """[rows] int32, where each row's episode stands in `ids`; −1 where it does not."""
+    position = np.empty(len(owner), np.int32)
+    for part in parts(len(owner)):
+        at = np.minimum(np.searchsorted(ids, owner[part]), len(ids) - 1)
+        position[part] = np.where(ids[at] == owner[part], at, -1)
+    return position
 
 
 def _owners(layout: Layout, frames: Frames) -> tuple[np.ndarray, list[str]]:
@@ -162,7 +171,10 @@ def _by_frame_index(
     """Check, and where it is without doubt mend, the order of the frames within episodes."""
     taken: Callable = (lambda values: values) if rows is None else (lambda values: values[rows])
     numbers, counts = taken(frames.frame_index), np.diff(starts)
-    wrong = numbers != np.arange(starts[-1]) - np.repeat(starts[:-1], counts)
+    wrong = np.zeros(starts[-1], bool)
+    for episodes, inside in blocks(starts):
+        expected = np.arange(inside.start, inside.stop) - np.repeat(starts[:-1][episodes], counts[episodes])
+        wrong[inside] = numbers[inside] != expected
     lengths = np.array([entry.length for entry in layout.episodes])
     clock = None if frames.timestamps is None else taken(frames.timestamps)
     said: dict[str, list[int]] = {}

@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError, did_you_mean
 from pipeline.lerobot_format.kinds import Guess, guess_kinds, state_column, steps_of, wrap
+from pipeline.lerobot_format.parts import parts
 from pipeline.lerobot_format.units import usual_range
 from pipeline.types import ACTION, STATE, ActionKind, Demonstrations, Semantics
 
@@ -77,12 +78,11 @@ def _with_settings(
             raise ConfigError(
                 f"kind names the action column '{name}', which does not exist. {did_you_mean(name, names)}"
             )
-    steps = steps_of(demonstrations)
     settled = list(guesses)
     for column, name in enumerate(names):
         if name not in wanted:
             continue
-        state = state_column(demonstrations, column, steps)
+        state = state_column(demonstrations, column)
         if wanted[name] == "position" and state is None:
             raise ConfigError(
                 f"kind says that the action '{name}' is a position, but no column of {STATE} matches it "
@@ -99,10 +99,9 @@ def _toml_key(name: str) -> str:
 
 def _find_circular(demonstrations: Demonstrations) -> dict[str, tuple[bool, ...]]:
     """Columns that a name or unit says are angles in radians, and that wrap."""
-    steps = steps_of(demonstrations)
     return {
         key: tuple(
-            _is_angle(name, unit) and _wraps(values[:, column], steps.first)
+            _is_angle(name, unit) and _wraps(demonstrations, values[:, column])
             for column, (name, unit) in enumerate(zip(feature.names, feature.units, strict=True))
         )
         for key, feature in demonstrations.features.items()
@@ -115,11 +114,12 @@ def _is_angle(name: str, unit: str | None) -> bool:
     return unit == "rad" or (unit is None and bool(words & _ANGLES))
 
 
-def _wraps(values: np.ndarray, first: np.ndarray) -> bool:
+def _wraps(demonstrations: Demonstrations, values: np.ndarray) -> bool:
     """All values lie within one turn, and between two frames the value jumps by more than half of it."""
-    if not len(first) or not float(np.ptp(values)) <= 2 * math.pi + 0.02:
+    if not float(np.ptp(values)) <= 2 * math.pi + 0.02:
         return False
-    return bool((np.abs(values[first + 1] - values[first]) > math.pi).any())
+    pairs = (steps.first for steps in steps_of(demonstrations))
+    return any(bool((np.abs(values[first + 1] - values[first]) > math.pi).any()) for first in pairs)
 
 
 def _set_circular(demonstrations: Demonstrations, wanted: Sequence[str]) -> dict[str, tuple[bool, ...]]:
@@ -166,10 +166,23 @@ def _tracking_lag(
         if guess.kind != "position" or guess.state_column is None:
             lags.append(None)
             continue
-        action = demonstrations.columns[ACTION][:, column].astype(np.float64)
-        behind = action - demonstrations.columns[STATE][:, guess.state_column]
-        lags.append(float(np.abs(wrap(behind) if turns[ACTION][column] else behind).mean()))
+        action, state = demonstrations.columns[ACTION][:, column], demonstrations.columns[STATE][:, guess.state_column]
+        total = 0.0
+        for part in parts(demonstrations.frames):
+            behind = action[part].astype(np.float64) - state[part]
+            total += float(np.abs(wrap(behind) if turns[ACTION][column] else behind).sum())
+        lags.append(total / demonstrations.frames)
     return tuple(lags)
+
+
+def _deviation(values: np.ndarray) -> float:
+    """The standard deviation of one column, in double precision, without a copy of it."""
+    if values.min() == values.max():
+        return 0.0
+    each = parts(len(values))
+    mean = sum(float(values[part].sum(dtype=np.float64)) for part in each) / len(values)
+    squares = sum(float(((values[part].astype(np.float64) - mean) ** 2).sum()) for part in each)
+    return math.sqrt(squares / len(values))
 
 
 def dead_columns(demonstrations: Demonstrations, feature: str, frames: np.ndarray | slice | None = None) -> np.ndarray:
@@ -183,7 +196,7 @@ def dead_columns(demonstrations: Demonstrations, feature: str, frames: np.ndarra
         return np.ones(values.shape[1], bool)
     widest = float((values.max(axis=0).astype(np.float64) - values.min(axis=0)).max())
     usual = np.array([usual_range(unit) or min(1.0, widest) for unit in demonstrations.features[feature].units])
-    deviation = np.array([column.astype(np.float64).std() for column in values.T])  # one at a time: memory
+    deviation = np.array([_deviation(column) for column in values.T])
     return (deviation == 0) | (deviation < DEAD * usual)
 
 
@@ -205,14 +218,13 @@ def _circular_warnings(
     """What was found circular, and columns of no known unit that jump by a whole turn."""
     if not found:
         return []
-    first = steps_of(demonstrations).first
     warnings = []
     for key, feature in demonstrations.features.items():
         for column, name in enumerate(feature.names):
             values = demonstrations.columns[key][:, column]
             if turns[key][column]:
                 warnings.append(f"{key}: '{name}' is an angle that wraps; it is treated as circular.")
-            elif feature.units[column] is None and float(np.ptp(values)) > 5.5 and _wraps(values, first):
+            elif feature.units[column] is None and float(np.ptp(values)) > 5.5 and _wraps(demonstrations, values):
                 warnings.append(
                     f"{key}: '{name}' jumps by a whole turn; if it is an angle in radians, list it in `circular`."
                 )
@@ -221,13 +233,13 @@ def _circular_warnings(
 
 def clock_warnings(demonstrations: Demonstrations) -> list[str]:
     """Where the recorded clock is not what fps says: horizons in seconds are then nominal."""
-    first = steps_of(demonstrations).first
-    seconds = np.diff(demonstrations.timestamps)[first]
+    stamps, step = demonstrations.timestamps, 1 / demonstrations.fps
+    seconds = np.concatenate([stamps[steps.first + 1] - stamps[steps.first] for steps in steps_of(demonstrations)])
     if not len(seconds):
         return []
-    step = 1 / demonstrations.fps
-    uneven = float((np.abs(seconds - step) > 0.2 * step).mean())
-    typical = float(np.median(seconds))
+    off = sum(int((np.abs(seconds[part] - step) > 0.2 * step).sum()) for part in parts(len(seconds)))
+    uneven = off / len(seconds)
+    typical = float(np.median(seconds, overwrite_input=True))
     warnings = []
     if abs(typical - step) > 0.05 * step:
         warnings.append(
@@ -269,7 +281,7 @@ def inspect_dataset(demonstrations: Demonstrations, semantics: Semantics) -> dic
 
 def _feature_summary(demonstrations: Demonstrations, semantics: Semantics, key: str) -> dict[str, Any]:
     feature, values = demonstrations.features[key], demonstrations.columns[key]
-    deviations = np.array([column.astype(np.float64).std() for column in values.T])  # one at a time: memory
+    deviations = np.array([_deviation(column) for column in values.T])
     means = values.mean(0, dtype=np.float64)
     numbers = {"min": values.min(0), "max": values.max(0), "mean": means, "std": deviations}
     return {

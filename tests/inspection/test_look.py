@@ -7,10 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.inspection.alike import IN_A_TREE
 from pipeline.inspection.finding import CHECKS, Finding, gather
 from pipeline.inspection.look import LOOK_AT, _look_at, inspect, view_command
 from pipeline.lerobot_format.quality import resolve_semantics
 from pipeline.lerobot_format.read import load_source
+from pipeline.types import STATE
+from speed.inspect import many
+from speed.planted import made_arm
+from speed.timing import peak_mb
 from tests.inspection.making import arm_takes, joined, look
 
 
@@ -143,3 +148,22 @@ def test_the_verdict_of_a_check_says_what_was_found():
     assert not fine
     assert words.startswith("Episode 12: It has 5 frames")
     assert inspection.verdict("jump")[0]
+
+
+def test_many_frames_are_looked_at_in_parts_and_take_less_memory_than_their_columns():
+    """More than one tree for duplicates, and several parts for everything else; the copy is in another tree."""
+    demos = many(made_arm(50, 0), 15)
+    assert demos.frames > IN_A_TREE
+    first, last = demos.episode(3), demos.episode(demos.episodes - 1)
+    length = min(first.stop - first.start, last.stop - last.start)
+    for values in demos.columns.values():
+        values[last.start : last.start + length] = values[first.start : first.start + length]
+    demos.columns[STATE][demos.episode_starts[400] + 60, 1] += 40
+    found = []
+    semantics = resolve_semantics(demos)
+    peak = peak_mb(lambda: found.append(inspect(demos, semantics)))
+    assert peak * 1e6 < sum(values.nbytes for values in demos.columns.values()) + 5e6
+    copied = [f for f in found[0].findings if f.check == "duplicate"]
+    assert {f.episode for f in copied} <= {3, demos.episodes - 1}
+    assert len(copied) == 1
+    assert 400 in {f.episode for f in found[0].findings if f.check == "jump"}
