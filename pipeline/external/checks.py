@@ -22,13 +22,14 @@ FITS, MUCH_BETTER = 0.75, 4.0
 CORRELATED, LESS_CORRELATED = 0.8, 0.3
 """Columns are permuted where each correlates so much with another one, and by so much less with its own."""
 UNITS = {
-    np.pi / 180: "radians where the data has degrees",
-    180 / np.pi: "degrees where the data has radians",
-    1e-3: "a unit a thousand times as large (metres for millimetres)",
-    1e3: "a unit a thousandth as large (millimetres for metres)",
-    1e-2: "a unit a hundred times as large (metres for centimetres, or shares for percent)",
-    1e2: "a unit a hundredth as large (centimetres for metres, or percent for shares)",
+    np.pi / 180: "radians are to degrees",
+    180 / np.pi: "degrees are to radians",
+    1e-3: "metres are to millimetres",
+    1e3: "millimetres are to metres",
+    1e-2: "metres are to centimetres, or shares to percent",
+    1e2: "centimetres are to metres, or percent to shares",
 }
+"""Factors between units, and what they are like; which unit the data has is for the data to say."""
 MOST_SHIFT = 10
 FRAMES_OF_EPISODE = 64
 """Frames compared of each pair of episodes."""
@@ -47,13 +48,14 @@ class Faults:
 class _Pair:
     """First actions predicted and recorded, [M, C] float64 over the columns that move and are no angles that wrap.
 
-    deviation  [C] of the recorded column      names [C]
+    deviation  [C] of the recorded column      names, units [C]
     """
 
     predicted: np.ndarray
     recorded: np.ndarray
     deviation: np.ndarray
     names: tuple[str, ...]
+    units: tuple[str | None, ...]
 
     def error(self, predicted: np.ndarray, recorded: np.ndarray) -> np.ndarray:
         """[C] mean squared difference in variances of the column: 1 for its mean, 0 for itself."""
@@ -74,8 +76,11 @@ def check_alignment(anchors: np.ndarray, actions: np.ndarray, demos: Demonstrati
     use &= recorded.std(axis=0) > 0
     if not use.any() or len(anchors) < 10:
         return Faults((), ())
-    names = tuple(name for name, used in zip(demos.features[ACTION].names, use, strict=True) if used)
-    pair = _Pair(first[:, use], recorded[:, use], recorded[:, use].std(axis=0), names)
+    names, units = (
+        tuple(one for one, used in zip(said, use, strict=True) if used)
+        for said in (demos.features[ACTION].names, demos.features[ACTION].units)
+    )
+    pair = _Pair(first[:, use], recorded[:, use], recorded[:, use].std(axis=0), names, units)
     refuse = _permuted(pair) or _normalised(pair, demos, use) or _scaled(pair)
     refuse = refuse or _early(pair, anchors, demos, use) or _mixed_up(pair, anchors, demos, use)
     warn = (
@@ -152,9 +157,18 @@ def _scaled(pair: _Pair) -> list[str]:
         return []
     columns = ", ".join(name for name, there in zip(pair.names, found, strict=True) if there)
     return [
-        f"the predictions of {columns} are in {UNITS[factor]}: divided by {factor:.4g}, they leave "
-        f"{_share(np.median(undone[factor][found]), 1)} of the variance unexplained. Convert them to the data set's unit"
+        f"the predictions of {columns} are in another unit than the data set ({_units_words(pair, found)}): divided by "
+        f"{factor:.4g}, as {UNITS[factor]}, they leave {_share(np.median(undone[factor][found]), 1)} of the variance unexplained. "
+        "Convert them to the data set's unit"
     ]
+
+
+def _units_words(pair: _Pair, found: np.ndarray) -> str:
+    """What the data set says of the unit of some columns."""
+    units = dict.fromkeys(unit for unit, there in zip(pair.units, found, strict=True) if there)
+    if not any(units):
+        return "which does not state its own"
+    return f"which has {' and '.join(unit or 'one that it does not state' for unit in units)}"
 
 
 def _shift_errors(pair: _Pair, anchors: np.ndarray, demos: Demonstrations, use: np.ndarray) -> dict[int, float]:

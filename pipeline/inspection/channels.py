@@ -7,6 +7,7 @@ import numpy as np
 from pipeline.inspection.finding import Finding
 from pipeline.inspection.motion import is_switch
 from pipeline.inspection.survey import Column, Survey, runs
+from pipeline.lerobot_format.quality import ASK_UNIT, dead_by_unit
 from pipeline.types import ACTION, STATE
 
 FEW = 4
@@ -35,17 +36,25 @@ OFTEN = 0.2
 def check_dead(survey: Survey) -> Iterator[Finding]:
     for feature, dead in survey.dead.items():
         names, places = survey.demos.features[feature].names, np.flatnonzero(dead)
+        by_unit = dead_by_unit(survey.demos, feature)
         if len(places) > FEW:
+            ask = f" {by_unit.sum()} of them only for their unit. {ASK_UNIT}." if by_unit.any() else ""
             yield Finding(
-                "dead", None, None, len(places), FEW, f"{len(places)} of {len(names)} columns of {feature} hardly move."
+                "dead",
+                None,
+                None,
+                len(places),
+                FEW,
+                f"{len(places)} of {len(names)} columns of {feature} hardly move.{ask}",
             )
             continue
         for place in places:
-            values = survey.demos.columns[feature][:, place]
+            values, unit = survey.demos.columns[feature][:, place], survey.demos.features[feature].units[place]
+            ask = f", next to nothing for {unit}. {ASK_UNIT}" if by_unit[place] else ""
             yield Finding(
                 "dead", None, f"{feature}/{names[place]}", float(values.std(dtype=np.float64)), None,
-                f"{feature}/{names[place]} hardly moves: it lies between {values.min():.4g} and {values.max():.4g} in all frames. "
-                "It cannot be learned, and is left out of errors divided by the deviation.",
+                f"{feature}/{names[place]} hardly moves: it lies between {values.min():.4g} and {values.max():.4g} in all "
+                f"frames{ask}. It cannot be learned, and is left out of errors divided by the deviation.",
             )  # fmt: skip
 
 

@@ -192,23 +192,42 @@ def dead_columns(demonstrations: Demonstrations, feature: str, frames: np.ndarra
     less (small steps in metres must not count as dead).
     """
     values = demonstrations.columns[feature][slice(None) if frames is None else frames]
+    return _dead_with(values, demonstrations.features[feature].units)
+
+
+def _dead_with(values: np.ndarray, units: Sequence[str | None]) -> np.ndarray:
+    """[D] bool, whether columns are dead in these units."""
     if not len(values):
         return np.ones(values.shape[1], bool)
     widest = float((values.max(axis=0).astype(np.float64) - values.min(axis=0)).max())
-    usual = np.array([usual_range(unit) or min(1.0, widest) for unit in demonstrations.features[feature].units])
+    usual = np.array([usual_range(unit) or min(1.0, widest) for unit in units])
     deviation = np.array([_deviation(column) for column in values.T])
     return (deviation == 0) | (deviation < DEAD * usual)
+
+
+def dead_by_unit(demonstrations: Demonstrations, feature: str) -> np.ndarray:
+    """[D] bool: dead columns that move, only by next to nothing for their unit. The unit may be the wrong one."""
+    values, units = demonstrations.columns[feature], demonstrations.features[feature].units
+    return _dead_with(values, units) & ~_dead_with(values, [None] * len(units))
+
+
+ASK_UNIT = "Is that the unit? Say the right one with `units` under the data set in demobench.toml"
 
 
 def dead_warnings(demonstrations: Demonstrations) -> list[str]:
     """Columns of actions and states that hardly move."""
     warnings = []
     for key in (ACTION, STATE):
-        names = demonstrations.features[key].names
-        dead = [names[column] for column in np.flatnonzero(dead_columns(demonstrations, key))]
+        names, units = demonstrations.features[key].names, demonstrations.features[key].units
+        by_unit = dead_by_unit(demonstrations, key)
+        dead = [names[column] for column in np.flatnonzero(dead_columns(demonstrations, key) & ~by_unit)]
+        left_out = "; left out of errors divided by the deviation" if key == ACTION else ""
         if dead:
-            left_out = "; left out of errors divided by the deviation" if key == ACTION else ""
             warnings.append(f"{key}: {', '.join(dead)} hardly move{'s' if len(dead) == 1 else ''} (dead){left_out}.")
+        warnings += [
+            f"{key}: {names[column]} hardly moves for {units[column]} (dead){left_out}. {ASK_UNIT}."
+            for column in np.flatnonzero(by_unit)
+        ]
     return warnings
 
 

@@ -90,10 +90,13 @@ def test_an_honest_policy_is_never_refused(bench, policy):
 FAULTS = {
     "two columns swapped": (lambda b: b.noisy(b.recorded[:, [1, 0, 2]]), ["permuted", "a0 holds a1", "a1 holds a0"]),
     "all columns moved": (lambda b: b.noisy(b.recorded[:, [2, 0, 1]]), ["permuted", "Expected the order a0, a1, a2"]),
-    "radians": (lambda b: np.deg2rad(b.noisy(b.recorded)), ["a0, a1, a2 are in radians where the data has degrees"]),
-    "degrees": (lambda b: np.rad2deg(b.noisy(b.recorded)), ["degrees where the data has radians"]),
-    "metres": (lambda b: b.noisy(b.recorded) / 1000, ["metres for millimetres"]),
-    "some in radians": (lambda b: b.noisy(b.recorded) * [0.01745, 0.01745, 1], ["a0, a1 are in radians"]),
+    "radians": (
+        lambda b: np.deg2rad(b.noisy(b.recorded)),
+        ["a0, a1, a2 are in another unit", "does not state its own", "as radians are to degrees"],
+    ),
+    "degrees": (lambda b: np.rad2deg(b.noisy(b.recorded)), ["divided by 57.3, as degrees are to radians"]),
+    "metres": (lambda b: b.noisy(b.recorded) / 1000, ["as metres are to millimetres"]),
+    "some in radians": (lambda b: b.noisy(b.recorded) * [0.01745, 0.01745, 1], ["a0, a1 are in another unit"]),
     "standardised": (lambda b: (b.noisy(b.recorded) - b.mean) / b.deviation, ["normalised (mean 0 and deviation 1)"]),
     "between -1 and 1": (
         lambda b: 2 * (b.noisy(b.recorded) - b.recorded.min(0)) / np.ptp(b.recorded, axis=0) - 1,
@@ -118,6 +121,16 @@ def test_a_planted_fault_is_named(bench, fault):
     (text,) = bench.check(make(bench)).refuse
     for words in expected:
         assert words in text
+
+
+def test_the_unit_of_the_data_set_is_named_only_where_it_is_stated():
+    bench = sweeps()
+    feature = replace(bench.demos.features[ACTION], units=("deg", None, "mm"))
+    stated = Bench(replace(bench.demos, features={**bench.demos.features, ACTION: feature}), bench.semantics)
+    (text,) = stated.check(np.deg2rad(stated.noisy(stated.recorded))).refuse
+    assert "in another unit than the data set (which has deg and one that it does not state and mm)" in text
+    (text,) = bench.check(np.deg2rad(bench.noisy(bench.recorded))).refuse
+    assert "which does not state its own" in text
 
 
 WARNED = {

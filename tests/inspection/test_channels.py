@@ -18,6 +18,16 @@ def test_a_dead_column_is_named_in_action_and_state():
     assert look(takes).lag_frames[1] is None
 
 
+def test_a_column_that_is_dead_by_its_unit_alone_asks_for_the_unit():
+    demos = joined(arm_takes())
+    units = {key: ("mm", *feature.units[1:]) for key, feature in demos.features.items()}
+    small = {key: values * [0.01, *[1] * (values.shape[1] - 1)] for key, values in demos.columns.items()}
+    findings = found(demonstrations(small, demos.lengths, fps=FPS, units=units), "dead")
+    assert len(findings) == 2
+    assert all("next to nothing for mm. Is that the unit?" in finding.words for finding in findings)
+    assert all("`units`" in finding.words for finding in findings)
+
+
 def test_many_dead_columns_are_counted():
     demos = joined(arm_takes())
     state = np.hstack([demos.columns[STATE], np.ones((demos.frames, 6))])

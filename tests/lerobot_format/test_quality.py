@@ -12,7 +12,14 @@ from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
 from pipeline.lerobot_format.kinds import wrap
-from pipeline.lerobot_format.quality import dead_columns, inspect_dataset, resolve_semantics, usual_range
+from pipeline.lerobot_format.quality import (
+    dead_by_unit,
+    dead_columns,
+    dead_warnings,
+    inspect_dataset,
+    resolve_semantics,
+    usual_range,
+)
 from pipeline.lerobot_format.read import read_dataset
 from pipeline.types import ACTION, STATE, Demonstrations
 from tests.makers import Recording, demonstrations_of, tiny_demonstrations, tiny_recording
@@ -120,6 +127,27 @@ def test_a_column_that_never_moves_follows_the_others():
     semantics = resolve_semantics(demonstrations_of(with_feature(recording, ACTION, names, values)))
     assert semantics.kinds == ("velocity",) * 3
     assert semantics.warnings == ("action: joint_1 hardly moves (dead); left out of errors divided by the deviation.",)
+
+
+def test_a_unit_that_makes_a_moving_column_dead_is_asked_about():
+    """A gripper from 0 to 1 that somebody said is in millimetres."""
+    demos = tiny_demonstrations()
+    features = {
+        key: replace(feature, units=(None, "mm")) if key in (ACTION, STATE) else feature
+        for key, feature in demos.features.items()
+    }
+    wrong = replace(demos, features=features)
+    assert dead_columns(wrong, ACTION).tolist() == [False, True]
+    assert dead_by_unit(wrong, ACTION).tolist() == [False, True]
+    assert not dead_by_unit(demos, ACTION).any()
+    action, state = dead_warnings(wrong)
+    assert action.startswith(
+        "action: joint_1 hardly moves for mm (dead); left out of errors divided by the deviation. Is that"
+    )
+    assert "the unit?" in state
+    assert "`units`" in state
+    still = {key: np.zeros_like(values) for key, values in demos.columns.items()}
+    assert not dead_by_unit(replace(wrong, columns=still), ACTION).any(), "no unit makes it move"
 
 
 def test_kinds_as_set():
