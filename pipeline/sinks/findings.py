@@ -339,13 +339,13 @@ def _first_step_floor(table: Table, best: Row) -> list[Sentence]:
         if short == "at the floor":
             return [["It is ", Strong("at the floor"), f" of {of} at the first action, {beside}{rmse}."]]
         above = Strong(f"{short}{rmse} above the floor")
-        return [["It is ", above, f" {beside}: for {of} that is {show(gap['floor'])} at the first action."]]
+        return [["It is ", above, f" {beside}: for {of} that is {show(gap['floor'])}{rmse} at the first action."]]
     why = without_floor(table).get(best["observations"])
     if why is None:
         return []
     floor = floors_at_first_step(table)[best["observations"]]
     limit = limit_words(table, floor, bracket_of(table, floor))
-    rest = f" The floor is {limit} (RMSE)." if limit else ""
+    rest = f" The floor of the RMSE is {limit}." if limit else ""
     return [[Strong("No floor"), f" can be given at the first action: {why.split(': ')[0]}.{rest}"]]
 
 

@@ -28,7 +28,7 @@ def test_the_answer_of_a_benchmark(table):
         "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]. It is better than hold-still, whose "
         "error is 4.44 times as large.",
         "Whether it is better than the second, mlp_k04, is not tested here; demobench compare small tests all pairs.",
-        "It is 1.62 px RMSE above the floor [1.25, 2.00]: for policies seeing state that is 4.00 at the first action.",
+        "It is 1.62 px RMSE above the floor [1.25, 2.00]: for policies seeing state that is 4.00 px RMSE at the first action.",
         "In closed loop mlp_k04 seeing state succeeds most often: 41 of 50 (69–91 %).",
     ]
     assert Strong("better than hold-still") in answer(table)[0]
@@ -123,10 +123,10 @@ def test_a_refused_floor_is_said_with_what_is_known(table):
     table["policies"][0]["above_floor"] = []
     table["floor"]["estimates"] = [make_refusal()]
     table["brackets"] = [make_bracket(lower=None)]
-    known = "No floor can be given at the first action: the states differ. The floor is not above 5.62 px, which mlp_k01 reaches"
-    assert f"{known} (RMSE)." in said(table)
+    known = "No floor can be given at the first action: the states differ. The floor of the RMSE is not above 5.62 px, which"
+    assert f"{known} mlp_k01 reaches." in said(table)
     table["floor"]["estimates"] = [make_refusal(below=3.3444)]
-    assert any("The floor is not above 3.34 px (RMSE)." in sentence for sentence in said(table))
+    assert any("The floor of the RMSE is not above 3.34 px." in sentence for sentence in said(table))
     assert without_floor(table) == {"state": "the states differ: too much"}
     assert limit_words(table, make_refusal(below=None), None) == ""
 
