@@ -146,6 +146,26 @@ def test_a_narrow_console_gets_fewer_columns_not_broken_ones(table, width):
     assert "left out for want of width: trained s" in text
 
 
+def test_the_answers_give_way_last():
+    """At 80 columns the verdicts, the error one second ahead and the distance to the floor are there; what all rows share is
+    not, and neither are the costs of training."""
+    demos = make_demos()
+    table = make_table(demos, make_semantics(demos))
+    table["dataset"]["warnings"] = []
+    for row, name in zip(table["policies"], ("constant_velocity", "mlp_k32", "hold_still"), strict=True):
+        row.update(policy=name, at_one_second_mae=8.0, above_floor=[], rollouts=None)
+        row["verdict"] = make_verdict(vs_hold_still="better", vs_hold_still_at_one_second="worse")
+    text = drawn(table, 80)
+    (row,) = [line for line in text.splitlines() if line.startswith(" constant_velocity")]
+    assert "✓ better" in row
+    assert "8.000 ✗" in row
+    assert len(row) <= 80
+    (left,) = [line for line in text.splitlines() if line.startswith("left out for want of width")]
+    assert "sees (state)" in left
+    table["policies"][0]["observations"] = "pose"
+    assert "sees (" not in drawn(table, 80)
+
+
 def test_verdicts_and_distances_to_floors_stand_beside_the_numbers():
     demos = make_demos()
     table = make_table(demos, make_semantics(demos))

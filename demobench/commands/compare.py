@@ -403,8 +403,9 @@ NUMBERS: dict[str, Callable[["Comparison"], str]] = {
     "p, Holm": lambda row: _p(row.p_holm),
     "visible from": lambda row: "—" if row.smallest_seen is None else f"{row.smallest_seen:#.2g}",
 }
-"""The columns of numbers; those of `GIVE_WAY` are left out, in this order, where the console is too narrow."""
-GIVE_WAY = ("visible from", "95 %", "p, Holm", "a − b")
+"""The columns of numbers; those of `GIVE_WAY` are left out, in this order, where the console is too narrow. The verdict's
+words say how large a difference is, but not how sure: p stays longest."""
+GIVE_WAY = ("visible from", "95 %", "a − b", "p, Holm")
 
 
 def _footnotes(verdicts: Sequence["Comparison"], family: int, entries: Sequence[Entry]) -> list[str]:

@@ -8,6 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -46,7 +47,10 @@ def show_inspection(facts: Mapping[str, Any], console: Console, said_by_checks: 
     that findings repeat.
     """
     _show_facts(facts, console)
-    console.print(_columns(facts))
+    grid, left_out = _columns(facts, console)
+    console.print(grid)
+    if left_out:
+        console.print(f"left out for want of width: {', '.join(left_out)} (all in --json)", style="dim", soft_wrap=True)
     for camera in facts["cameras"]:
         there = "there" if camera["present"] else "declared, but its files are absent"
         console.print(f"camera {plain(camera['key'])} {camera['width']}×{camera['height']}: {there}", soft_wrap=True)
@@ -85,20 +89,42 @@ def _show_facts(facts: Mapping[str, Any], console: Console) -> None:
     console.print(f"[dim]content hash {facts['content_hash']}[/]\n", soft_wrap=True)
 
 
-def _columns(facts: Mapping[str, Any]) -> Table:
-    """A row a column; what only action columns have is empty for the others."""
-    table = Table("column", "unit", "kind", "tracking lag", "mean |a − s|", "range", title_justify="left")
+def _columns(facts: Mapping[str, Any], console: Console) -> tuple[Table, list[str]]:
+    """A row a column; what only action columns have is empty for the others. Where the console is too narrow, numbers
+    give way, names never: the heads of those that did.
+    """
+    heads, left_out = list(HEADS), []
+    while True:
+        grid = _grid(facts, heads)
+        gives_way = next((head for head in GIVE_WAY if head in heads), None)
+        fits = console.measure(grid, options=console.options.update(width=1000)).maximum <= console.width
+        if fits or gives_way is None:
+            return grid, left_out
+        heads.remove(gives_way)
+        left_out.append(gives_way)
+
+
+def _grid(facts: Mapping[str, Any], heads: Sequence[str]) -> Table:
+    grid = Table(box=box.SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    for head in heads:
+        grid.add_column(head, overflow="fold", no_wrap=head != "column")
     for feature in sorted(facts["features"], key=lambda feature: feature["key"] != "action"):
-        table.add_row(f"[bold]{plain(feature['key'])}[/]")
+        grid.add_row(f"[bold]{plain(feature['key'])}[/]")
         if len(feature["names"]) > WIDE:
-            table.add_row(f"  {len(feature['names'])} columns", "", "", "", "", _wide_range(feature))
+            cells = {"column": f"  {len(feature['names'])} columns", "range": _wide_range(feature)}
+            grid.add_row(*(cells.get(head, "") for head in heads))
             continue
         for position in range(len(feature["names"])):
-            table.add_row(*_row(facts, feature, position))
-    return table
+            cells = _cells(facts, feature, position)
+            grid.add_row(*(cells[head] for head in heads))
+    return grid
 
 
-def _row(facts: Mapping[str, Any], feature: Mapping[str, Any], position: int) -> tuple[str, ...]:
+HEADS = ("column", "unit", "kind", "tracking lag", "mean |a − s|", "range")
+GIVE_WAY = ("mean |a − s|", "tracking lag", "range")
+
+
+def _cells(facts: Mapping[str, Any], feature: Mapping[str, Any], position: int) -> dict[str, str]:
     kind, lag, gap = "", "", ""
     if feature["key"] == "action":
         kind = facts["action_kinds"][position]
@@ -111,7 +137,9 @@ def _row(facts: Mapping[str, Any], feature: Mapping[str, Any], position: int) ->
         kind += " angle"
     unit = feature["units"][position] or "?"
     values = f"{_number(feature['min'][position])} … {_number(feature['max'][position])}"
-    return f"  {plain(feature['names'][position])}", plain(unit), kind.strip(), lag, gap, values
+    return dict(
+        zip(HEADS, (f"  {plain(feature['names'][position])}", plain(unit), kind.strip(), lag, gap, values), strict=True)
+    )
 
 
 def _number(value: float | None) -> str:

@@ -91,7 +91,9 @@ def _styled(sentence: Sequence[str]) -> "Text":
 
 @dataclass(frozen=True)
 class _Column:
-    """A column of the text table: its head, a cell of a row, and the order in which it gives way (0: never)."""
+    """A column of the text table: its head, a cell of a row, and the order in which it gives way (0: never). What answers
+    a question (the verdicts, the error one second ahead, the floor) gives way last.
+    """
 
     head: str
     cell: Callable[[Mapping[str, Any]], str]
@@ -110,7 +112,13 @@ def _grid(
             return grid, left_out
         least = min(expendable, key=lambda column: column.gives_way)
         columns.remove(least)
-        left_out.append(" ".join(least.head.split()))
+        left_out.append(" ".join(least.head.split()) + (f" ({_the_set(table)})" if least.head == "sees" else ""))
+
+
+def _the_set(table: Mapping[str, Any]) -> str | None:
+    """The observation set, where all rows see the same one."""
+    sets = {row["observations"] for row in table["policies"]}
+    return sets.pop() if len(sets) == 1 else None
 
 
 def _draw(rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column], marked: str | None = None):
@@ -145,29 +153,29 @@ def _columns(table: Mapping[str, Any], unit: str | None) -> list[_Column]:
 
     columns = [
         _Column("policy", lambda row: escape(row["policy"]) + (" (seen in training)" if is_seen(row) else "")),
-        _Column("sees", lambda row: escape(row["observations"])),
+        _Column("sees", lambda row: escape(row["observations"]), 4 if _the_set(table) else 0),
         _Column(f"first step\nMAE{in_unit}", _first_step),
-        _Column("\n× hold-still", number("vs_hold_still", 3)),
+        _Column("\n× hold-still", number("vs_hold_still", 3), 10),
         *_verdicts(table),
-        _Column(f"\nRMSE{in_unit}", number("first_step_rmse"), 4),
+        _Column(f"\nRMSE{in_unit}", number("first_step_rmse"), 5),
     ]
     if any(first_step_gap(row) for row in rows):
-        columns.append(_Column("above floor\nRMSE", _above_floor, 9))
+        columns.append(_Column("above floor\nRMSE", _above_floor, 11))
     if any(len(row["error_by_joint"]) == 2 for row in rows):
-        columns.append(_Column(f"\nL2{in_unit}", number("first_step_l2"), 8))
+        columns.append(_Column(f"\nL2{in_unit}", number("first_step_l2"), 9))
     if unit is None:
-        columns.append(_Column("\nscaled", number("scaled", 3), 5))
+        columns.append(_Column("\nscaled", number("scaled", 3), 6))
     if any(row["at_one_second_mae"] is not None for row in rows):
-        columns.append(_Column(f"at 1 s\nMAE{in_unit}", _at_one_second, 10))
+        columns.append(_Column(f"at 1 s\nMAE{in_unit}", _at_one_second, 13))
     optional = [
-        ("whole_chunk_mae", f"whole chunk\nMAE{in_unit}", 7),
-        ("ensembled_first_step_mae", f"ensembled\nMAE{in_unit}", 6),
+        ("whole_chunk_mae", f"whole chunk\nMAE{in_unit}", 8),
+        ("ensembled_first_step_mae", f"ensembled\nMAE{in_unit}", 7),
     ]
     columns += [
         _Column(head, number(key), way) for key, head, way in optional if any(row[key] is not None for row in rows)
     ]
     if any(row["rollouts"] for row in rows):
-        columns += [_Column("success", _success), _Column("score", score, 11)]
+        columns += [_Column("success", _success), _Column("score", score, 12)]
     return [
         *columns,
         _Column("params", lambda row: f"{row['params']:,}" if row["params"] else "—", 3),
@@ -179,7 +187,7 @@ def _columns(table: Mapping[str, Any], unit: str | None) -> list[_Column]:
 def _verdicts(table: Mapping[str, Any]) -> list[_Column]:
     """What the tests say of the first step; a column without a word is left out."""
     rows, named = table["policies"], champion(table)
-    heads = {"vs_hold_still": ("against\nhold-still", 13), "vs_champion": ("against\nchampion", 12)}
+    heads = {"vs_hold_still": ("against\nhold-still", 15), "vs_champion": ("against\nchampion", 14)}
 
     def word(row: Mapping[str, Any], rival: str) -> str:
         if rival == "vs_champion" and address(row) == named:

@@ -148,6 +148,7 @@ def test_a_narrow_console_gives_up_numbers_but_no_verdict(place, capsys, monkeyp
     assert "left out for want of width: visible from" in shown
     assert "better: error" in shown
     assert "cannot tell: " in shown
+    assert "p, Holm   a is" in shown, "how sure a verdict is stays longer than how large the difference is"
 
 
 def test_one_of_them_against_a_whole_table(place):

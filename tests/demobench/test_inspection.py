@@ -14,12 +14,13 @@ from pipeline.types import ACTION, STATE
 from tests.inspection.making import NAMES, Take, arm_takes
 from tests.makers import Recording, tiny_recording, write_v3
 
-ENVIRONMENT = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
+ENVIRONMENT = {**os.environ, "NO_COLOR": "1"}
 
 
-def inspect(*words, cwd) -> subprocess.CompletedProcess:
+def inspect(*words, cwd, width: int = 160) -> subprocess.CompletedProcess:
     command = [sys.executable, "-m", "demobench.cli", "inspect", *map(str, words)]
-    return subprocess.run(command, cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+    environment = ENVIRONMENT | {"COLUMNS": str(width)}
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120)
 
 
 def said(argument, cwd) -> dict:
@@ -104,6 +105,16 @@ def test_names_in_square_brackets_and_control_characters_are_shown_as_they_are(t
     assert "[bold]lift[/] [link=file:///etc/passwd]it[/link]" in done.stdout
     assert "\x1b" not in done.stdout + done.stderr
     assert "\x07" not in done.stdout + done.stderr
+
+
+def test_names_are_whole_in_a_narrow_terminal_and_numbers_give_way(tmp_path):
+    write(tmp_path / "tape", arm_takes())
+    wide, narrow = (inspect("tape", cwd=tmp_path, width=width).stdout for width in (160, 60))
+    for name in NAMES:
+        assert f"   {name} " in narrow
+    assert "left out for want of width: mean |a − s|" in narrow
+    assert "tracking lag" in wide
+    assert "left out" not in wide
 
 
 def test_one_short_episode_is_inspected(tmp_path):
