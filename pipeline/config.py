@@ -227,6 +227,13 @@ def parse_config(raw: dict[str, Any], where: str) -> Config:
                 f"{where}: [policies.{name}] method '{policy.method}' does not exist. {did_you_mean(policy.method, METHODS)} "
                 'A class of your own is named by its file or module: method = "my_policy.py:MyPolicy".'
             )
+        sets = {"state", *(s for dataset in config.datasets.values() for s in dataset.observations)}
+        for named in () if policy.observations == "all" else policy.observations:
+            if named not in sets:
+                raise ConfigError(
+                    f"{where}: [policies.{name}] sees the observation set '{named}', which no data set has. "
+                    f"{did_you_mean(named, sets)}"
+                )
         if policy.settings and not is_own(policy.method):
             raise ConfigError(
                 f"{where}: [policies.{name}] has settings, which only a class of your own takes. Remove them."

@@ -13,7 +13,8 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.errors import ConfigError, DatasetError, did_you_mean
+from pipeline.errors import ConfigError, DatasetError
+from pipeline.lerobot_format.columns import check_observation_set
 from pipeline.normalize import Normalizer, commanded_columns, fit_normalizer
 from pipeline.types import ACTION, STATE, Demonstrations, Observations, ObservationSet, Protocol, Semantics
 
@@ -164,7 +165,7 @@ def make_windows(
     DatasetError : an episode is shorter than the history, or no window fits.
     NotApplicableError : `notebook`, and an action column commands no state column.
     """
-    check_features(demos, observation_set)
+    check_observation_set(observation_set, demos.columns, demos.name)
     _check_lengths(demos, history, chunk)
     if protocol == "notebook" and recipe == "arm":
         commanded_columns(demos, semantics)
@@ -188,26 +189,6 @@ def _anchors(demos: Demonstrations, episodes: Sequence[int], first: int, cut: in
     spans = [demos.episode(episode) for episode in episodes]
     anchors = [np.arange(span.start + first, span.stop - cut, dtype=np.int64) for span in spans]
     return np.concatenate([np.empty(0, np.int64), *anchors])
-
-
-def check_features(demos: Demonstrations, observation_set: ObservationSet) -> None:
-    """Every feature that an observation set names must be in the data.
-
-    Raises:
-        ConfigError: it is not ("did you mean").
-    """
-    for key in observation_set.features:
-        if key == ACTION:
-            raise ConfigError(
-                f"The observation set '{observation_set.name}' names '{ACTION}': a policy would see what it is to predict. "
-                "Leave it out."
-            )
-        if key not in demos.columns:
-            known = [name for name in demos.columns if name != ACTION]
-            raise ConfigError(
-                f"The observation set '{observation_set.name}' asks for '{key}', which the data set '{demos.name}' "
-                f"does not have as numbers. {did_you_mean(key, known)}"
-            )
 
 
 def _check_lengths(demos: Demonstrations, history: int, chunk: int) -> None:

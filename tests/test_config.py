@@ -27,6 +27,10 @@ def test_shipped_file_is_the_built_in_default():
         ({"datasets": {"a/b": {"source": "x"}}}, ["cannot be a name"]),
         ({"benchmark": {"seeds": 0}}, ["benchmark.seeds", "greater than or equal to 1"]),
         ({"benchmark": {"protocol": "loose"}}, ["benchmark.protocol", "'strict' or 'notebook'"]),
+        (
+            {"policies": {"mlp": {"method": "mlp", "chunks": [1], "observations": ["stat"]}}},
+            ["[policies.mlp] sees the observation set 'stat'", "Did you mean 'state'"],
+        ),
     ],
 )
 def test_mistakes_are_named(raw, words):

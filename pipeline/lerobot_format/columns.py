@@ -4,14 +4,14 @@ What belongs here: the choice, and making `action` and `observation.state` of it
 (frames.py, joined.py), what a column means (quality.py).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.errors import ConfigError, DatasetError, did_you_mean
 from pipeline.lerobot_format.units import canonical_unit
-from pipeline.types import ACTION, STATE, ColumnChoice, Feature
+from pipeline.types import ACTION, STATE, ColumnChoice, Feature, ObservationSet
 
 __all__ = ["ColumnChoice", "Roles", "arrange", "choose_roles", "set_units"]
 
@@ -120,10 +120,8 @@ def arrange(
     that an observation set may name it; those of the action do not: a policy would see what it is to predict. What had
     the name before and plays no part is left out.
     """
-    left, described = dict(columns), dict(features)
-    for key in {ACTION, STATE, *roles.action, *(roles.state if len(roles.state) == 1 else ())}:
-        left.pop(key, None)
-        described.pop(key, None)
+    kept = names_after(columns, roles)[2:]
+    left, described = {key: columns[key] for key in kept}, {key: features[key] for key in kept}
     first, about = {}, {}
     for key, parts in ((ACTION, roles.action), (STATE, roles.state)):
         values = [columns[part] for part in parts]
@@ -131,6 +129,31 @@ def arrange(
         units = tuple(unit for part in parts for unit in features[part].units)
         about[key] = Feature(key, _side_by_side([features[part] for part in parts]), units)
     return first | left, about | described
+
+
+def names_after(known: Iterable[str], roles: Roles) -> list[str]:
+    """The features there are once `arrange` has made action and state of those with a role."""
+    gone = {ACTION, STATE, *roles.action, *(roles.state if len(roles.state) == 1 else ())}
+    return [ACTION, STATE, *(name for name in known if name not in gone)]
+
+
+def check_observation_set(observation_set: ObservationSet, known: Collection[str], name: str) -> None:
+    """Every feature that an observation set names must be among the features of numbers of the data set `name`.
+
+    Raises:
+        ConfigError: it is not ("did you mean"), or it is the action.
+    """
+    for key in observation_set.features:
+        if key == ACTION:
+            raise ConfigError(
+                f"The observation set '{observation_set.name}' names '{ACTION}': a policy would see what it is to predict. "
+                "Leave it out."
+            )
+        if key not in known:
+            raise ConfigError(
+                f"The observation set '{observation_set.name}' asks for '{key}', which the data set '{name}' "
+                f"does not have as numbers. {did_you_mean(key, [one for one in known if one != ACTION])}"
+            )
 
 
 def _side_by_side(parts: Sequence[Feature]) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.errors import DatasetError
 from pipeline.experiment import Experiment
 from pipeline.lerobot_format.archives import is_archive, unpacked
-from pipeline.lerobot_format.columns import arrange, set_units
+from pipeline.lerobot_format.columns import arrange, check_observation_set, names_after, set_units
 from pipeline.lerobot_format.frames import Frames, read_frames
 from pipeline.lerobot_format.joined import check_names, join_feature, stamp_of_features
 from pipeline.lerobot_format.layout import Layout, read_layout
@@ -193,20 +193,28 @@ def load_experiment(experiment: Experiment, config_dir: Path) -> tuple[Demonstra
     """The demonstrations that an experiment is about, read from their source, and what their columns mean.
 
     Raises:
-        DatasetError, ConfigError: as `load_source` and `resolve_semantics`.
+        DatasetError, ConfigError: as `load_source` and `resolve_semantics`; an observation set names no feature.
     """
     dataset = experiment.dataset
     demos = load_source(dataset.source, name=experiment.name, config_dir=config_dir, choice=dataset.choice(config_dir))
+    for observation_set in experiment.observation_sets:
+        check_observation_set(observation_set, demos.columns, experiment.name)
     return demos, resolve_semantics(demos, kind=dataset.kind, circular=dataset.circular)
 
 
 def check_experiment(experiment: Experiment, config_dir: Path) -> None:
-    """Fail in a moment, before any work, where the source is not there or is no data set (the Hub is not asked)."""
+    """Fail in a moment, before any work, where the source is not there or is no data set, or an observation set names a
+    feature that it does not have (the Hub is not asked).
+    """
     dataset = experiment.dataset
+    choice = dataset.choice(config_dir)
     source_stamp(dataset.source, config_dir)
-    stamp_of_features(dataset.choice(config_dir).features)
+    stamp_of_features(choice.features)
     if not dataset.source.startswith((EMBEDDED, HUB)):
-        read_layout(source_folder(dataset.source, config_dir), dataset.choice(config_dir))
+        layout = read_layout(source_folder(dataset.source, config_dir), choice)
+        known = names_after({**layout.features, **dict.fromkeys(choice.features)}, layout.roles)
+        for observation_set in experiment.observation_sets:
+            check_observation_set(observation_set, known, experiment.name)
 
 
 def _with_warnings(demonstrations: Demonstrations, more: tuple[str, ...]) -> Demonstrations:

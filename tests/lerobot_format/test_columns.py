@@ -334,6 +334,19 @@ def test_what_is_checked_before_any_work(place: Path):
         check_experiment(experiment_of(place), place)
 
 
+def test_a_misspelt_feature_of_an_observation_set_is_refused_before_any_work(place: Path):
+    """By the lists in meta/ alone where a run begins, and by whatever reads the data set."""
+    wrong = 'seen = ["observation.forse"]'
+    (place / "demobench.toml").write_text(FILE.replace('seen = ["observation.force"]', wrong))
+    message = r"observation set 'seen' asks for 'observation.forse'.*Did you mean 'observation\.force'"
+    for check in (check_experiment, load_experiment):
+        with pytest.raises(ConfigError, match=message):
+            check(experiment_of(place), place)
+    (place / "demobench.toml").write_text(FILE.replace('seen = ["observation.force"]', 'seen = ["action"]'))
+    with pytest.raises(ConfigError, match="a policy would see what it is to predict"):
+        check_experiment(experiment_of(place), place)
+
+
 def test_the_documented_example(tmp_path: Path):
     example = re.search(r"```toml\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)[1]
     (tmp_path / "demobench.toml").write_text(example)
