@@ -426,9 +426,12 @@ def main() -> None:
 
 
 def _escape(text: str) -> str:
+    """A message as it is, whatever the files that it quotes may hold: no markup, nothing that a terminal obeys."""
     from rich.markup import escape
 
-    return escape(text)
+    from pipeline.errors import printable
+
+    return escape("\n".join(map(printable, text.split("\n"))))
 
 
 if __name__ == "__main__":

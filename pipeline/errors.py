@@ -12,8 +12,11 @@ A message says what is wrong, where, what was expected and what to do. Programmi
 their traceback.
 """
 
+import re
 from collections.abc import Iterable
 from difflib import get_close_matches
+
+_OBEYED = re.compile(r"[\x00-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 
 
 class DemobenchError(Exception):
@@ -51,3 +54,10 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     if close:
         return f"Did you mean '{close[0]}'?"
     return f"Known: {', '.join(known)}." if known else ""
+
+
+def printable(words: str) -> str:
+    """Words that somebody else wrote, without the characters that a terminal obeys: control characters, and those that turn
+    the direction of writing. White space among them becomes a space, the rest a replacement character.
+    """
+    return _OBEYED.sub(lambda found: " " if found[0].isspace() else "\N{REPLACEMENT CHARACTER}", words)

@@ -198,6 +198,17 @@ def test_names_are_never_markup_in_a_sentence():
     assert "seeing [red]x[/red]: 4.50 px" in drawn(table, 200)
 
 
+def test_what_a_checkpoint_says_of_its_training_is_never_markup():
+    demos = make_demos()
+    table = make_table(demos, make_semantics(demos))
+    table["dataset"]["warnings"] = []
+    elsewhere = {"method": "external", "training": "trained on [/] [red]x", "warnings": ["[bold]odd"], "samples": None}
+    table["policies"][0].update(elsewhere, episodes=[1, 2], seen_in_training=None)
+    text = drawn(table, 200)
+    assert ": trained on [/] [red]x" in text
+    assert ": [bold]odd" in text
+
+
 def test_parts_that_other_commands_show():
     demos = random_walks((50,) * 2)
     refused = radius_floor(demos, semantics(demos), STATE_ONLY, radius=1e-6)

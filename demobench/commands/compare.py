@@ -325,6 +325,8 @@ def _row_json(entry: Entry) -> dict[str, Any]:
 
 def show_verdicts(verdicts: Sequence["Comparison"], family: int, entries: Sequence[Entry], console: "Console") -> None:
     """A table a metric, and what the numbers rest on."""
+    from rich.markup import escape
+
     short = _short_names(entries)
     left_out: list[str] = []
     console.print()
@@ -337,7 +339,7 @@ def show_verdicts(verdicts: Sequence["Comparison"], family: int, entries: Sequen
     narrow = [f"left out for want of width: {', '.join(left_out)} (all in --json)"] if left_out else []
     notes = [line for line in _footnotes(verdicts, family, entries) if line.split(":")[0] not in left_out]
     for line in (*notes, *narrow):
-        console.print(line, style="dim", soft_wrap=True)
+        console.print(escape(line), style="dim", soft_wrap=True)
     console.print()
 
 

@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from demobench.commands.session import open_dataset, open_session, write_json_to
+from pipeline.errors import printable
 from pipeline.inspection.finding import CHECKS
 
 WIDE = 24
@@ -64,7 +65,7 @@ def show_inspection(facts: Mapping[str, Any], console: Console, said_by_checks: 
 
 def plain(words: str) -> str:
     """What others wrote, to be printed as it is: no markup, and no characters that a terminal obeys."""
-    return escape("".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in words))
+    return escape(printable(words))
 
 
 def _show_facts(facts: Mapping[str, Any], console: Console) -> None:

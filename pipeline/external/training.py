@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, printable
 from pipeline.types import Demonstrations
 
 LARGEST = 20_000_000
@@ -113,7 +113,7 @@ def _of_split(value: Mapping[str, Any], path: Path, demos: Demonstrations) -> Tr
 def _of_lerobot(dataset: Mapping[str, Any], path: Path) -> Training:
     """The `dataset` of LeRobot's train_config.json; no list of episodes means all of them."""
     episodes = dataset["episodes"]
-    named = str(dataset.get("repo_id") or dataset.get("root") or "a data set that it does not name")[:200]
+    named = printable(str(dataset.get("repo_id") or dataset.get("root") or "a data set that it does not name"))[:200]
     words = f"{path.name} (trained on {named})"
     return Training({EVERY_FOLD: None if episodes is None else _numbers(episodes, path, "dataset.episodes")}, {}, words)
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-from pipeline.errors import PolicyError
+from pipeline.errors import PolicyError, printable
 
 SCRIPT = Path(__file__).with_name("predict_checkpoint.py")
 INSTALL = "python3.12 -m venv lerobot-env && lerobot-env/bin/pip install 'lerobot[training,diffusion,smolvla]==0.6.1'"
@@ -164,7 +164,8 @@ def _facts(code: int, last: str, log: Path) -> CheckpointFacts:
         raise PolicyError(
             f"The LeRobot environment did not say what it predicted; its last line was: {last!r}"
         ) from None
-    values["observations"] = tuple(values["observations"])
+    values["observations"] = tuple(map(printable, values["observations"]))
+    values["started_from"] = printable(str(values["started_from"])) if values["started_from"] else None
     if isinstance(values["trained_on"], list):
         values["trained_on"] = tuple(values["trained_on"])
     return CheckpointFacts(**values)

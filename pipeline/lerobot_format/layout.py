@@ -12,7 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ConfigError, DatasetError
+from pipeline.errors import ConfigError, DatasetError, printable
 from pipeline.lerobot_format.cameras import read_camera
 from pipeline.lerobot_format.columns import Roles, choose_roles
 from pipeline.lerobot_format.files import fill, inside, read_json, read_json_lines, read_table
@@ -124,7 +124,7 @@ def read_layout(folder: Path, choice: ColumnChoice = AS_RECORDED) -> Layout:
     return Layout(
         folder=folder,
         fps=_fps(info),
-        robot_type=robot if isinstance(robot, str) and robot else None,
+        robot_type=printable(robot) if isinstance(robot, str) and robot else None,
         features=features,
         roles=roles,
         listed=listed,
@@ -185,6 +185,10 @@ def _declared(info: _Info) -> dict[str, dict[str, Any]]:
     if not isinstance(features, dict):
         raise DatasetError(f"{info.path}: 'features' is missing. It gives each column its dtype and shape.")
     for key, feature in features.items():
+        if printable(key) != key:
+            raise DatasetError(
+                f"{info.path}: the name of the feature {key!r} holds control characters. Rename it, in the data files too."
+            )
         if isinstance(feature, dict) and isinstance(shape := feature.get("shape"), int) and not isinstance(shape, bool):
             feature["shape"] = [shape]
         if _is_picture(feature) and not _has_dtype_and_shape(feature):
@@ -319,7 +323,7 @@ def _entry(info: _Info, row: dict[str, Any], has_place: bool) -> EpisodeEntry:
     if file is not None:
         inside(info.folder, file)
     tasks = row.get("tasks")
-    words = ("; ".join(map(str, tasks)) if isinstance(tasks, list) else str(tasks)) if tasks else None
+    words = printable("; ".join(map(str, tasks)) if isinstance(tasks, list) else str(tasks)) if tasks else None
     return EpisodeEntry(_whole(info, row, "episode_index"), _whole(info, row, "length"), file, words)
 
 
@@ -359,4 +363,4 @@ def _tasks(info: _Info) -> dict[int, str]:
         pairs = [(row.get("task_index"), row.get("task")) for row in rows]
     else:
         return {}
-    return {number: str(word) for number, word in pairs if isinstance(number, int) and word is not None}
+    return {number: printable(str(word)) for number, word in pairs if isinstance(number, int) and word is not None}

@@ -7,6 +7,8 @@ import math
 import re
 from typing import Any
 
+from pipeline.errors import printable
+
 _UNITS = {
     "px": "px", "pixel": "px", "pixels": "px",
     "rad": "rad", "radian": "rad", "radians": "rad",
@@ -53,9 +55,9 @@ def column_names(key: str, declared: Any, width: int) -> tuple[str, ...] | None:
     """Names for the `width` columns of a feature, or None where `names` is there but does not fit.
 
     `declared` is `names` in info.json: a flat list, one nested in a mapping (`{"motors": [...]}`), several such lists
-    one after another, a mapping name → position, or nothing.
+    one after another, a mapping name → position, or nothing. Characters that a terminal obeys are taken out.
     """
-    names = list(_flat(declared))
+    names = [printable(name) for name in _flat(declared)]
     if not names:
         return (key.rsplit(".", 1)[-1],) if width == 1 else tuple(str(i) for i in range(width))
     if len(names) == width and len(set(names)) == width:

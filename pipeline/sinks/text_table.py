@@ -54,7 +54,7 @@ def render_table(table: Mapping[str, Any], console: "Console", marked: str | Non
     console.print()
     narrow = [f"left out for want of width: {', '.join(left_out)} (all in --json)"] if left_out else []
     for line in (*_footnotes(table), *narrow):
-        console.print(line, style="dim", soft_wrap=True)
+        console.print(escape(line), style="dim", soft_wrap=True)
     for warning in dataset["warnings"]:
         console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
     console.print()

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.makers import tiny_recording, write_v3
+from tests.makers import edit_info, tiny_recording, write_v3
 
 ENVIRONMENT = {**os.environ, "COLUMNS": "160", "NO_COLOR": "1"}
 QUICK = ["--seeds", "1", "--steps", "4", "--chunks", "1", "--folds", "1"]
@@ -120,6 +120,15 @@ def test_mistakes_are_one_message(place, words, expected):
     assert out.stderr.count("error:") == 1
     for word in expected:
         assert word in " ".join(out.stderr.split())
+
+
+def test_an_error_that_quotes_a_file_holds_nothing_that_a_terminal_obeys(place):
+    """A version that clears the screen, in a data set from a stranger."""
+    write_v3(place / "strange", tiny_recording(2, 8))
+    edit_info(place / "strange", lambda info: info.update(codebase_version="\x1b[2J[bold]v9\x07"))
+    out = demobench("inspect", "strange", cwd=place)
+    assert out.returncode == 2
+    assert "codebase_version is '\ufffd[2J[bold]v9\ufffd'" in " ".join(out.stderr.split())
 
 
 def test_a_folder_that_is_no_data_set_leaves_nothing_behind(place):
