@@ -50,11 +50,8 @@ def demonstrations(
         from pipeline.lerobot_format.read import load_experiment
         from pipeline.lerobot_format.saved import save_demonstrations
         from pipeline.sinks.pictures import picture_demonstration
-        from pipeline.windows import check_features
 
         demos, semantics = load_experiment(bench.experiment, workbench.config_dir)
-        for observation_set in bench.experiment.observation_sets:
-            check_features(demos, observation_set)
         save_demonstrations(demos, draft / "frames")
         picture_demonstration(demos, semantics, draft / "trajectories.png")
         stored = hash_again(draft / "frames")
