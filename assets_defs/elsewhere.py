@@ -9,6 +9,7 @@ from pydantic import Field
 
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
 from assets_defs.plan import SCORED, Plan, Unit
+from assets_defs.policies import tracking
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import picture, present, table
 from pipeline.config import check_slug
@@ -83,7 +84,7 @@ def elsewhere_assets() -> list[dg.AssetsDefinition]:
         key=KEY,
         partitions_def=PARTITIONS,
         group_name="elsewhere",
-        kinds={"numpy", "parquet"},
+        kinds={"numpy", "parquet", "mlflow"},
         deps=[demonstrations, episode_split],
         code_version=code_version(SCORED),
         check_specs=[
@@ -123,9 +124,14 @@ def elsewhere_assets() -> list[dg.AssetsDefinition]:
             f"error_by_horizon_{name}": picture(bench.plan.folder(Unit(SCORED, name)) / "error_by_horizon.png")
             for name in made
         }
+        links = {f"mlflow_{name}": dg.MetadataValue.text(m.summary["mlflow_run_id"]) for name, m in made.items()}
         header = ["name", "observations", "first-step MAE", "episodes", "training"]
         return result(
-            bench, KEY, made, present({"scores": table(header, rows), **pictures}), ["aligned", "whole_episodes"]
+            bench,
+            KEY,
+            made,
+            present({"scores": table(header, rows), **pictures, **links}),
+            ["aligned", "whole_episodes"],
         )
 
     return [scored_predictions]
@@ -145,6 +151,7 @@ def _score(bench: Bench, request: Request, draft: Path) -> Outcome:
     from pipeline.external.scoring import ELSEWHERE, score_file
     from pipeline.external.training import read_training
     from pipeline.predict import save_predictions
+    from pipeline.sinks import to_mlflow
     from pipeline.sinks.pictures import picture_horizons
     from pipeline.statistics.metrics import save_errors
 
@@ -164,10 +171,28 @@ def _score(bench: Bench, request: Request, draft: Path) -> Outcome:
     everyone = [v.name for v in bench.plan.variants] + [request.name]
     picture_horizons(scored.score.metrics, request.name, everyone, demos, draft / "error_by_horizon.png")
     summary = scored.summary(demos)
+    asked = bench.plan.asked[request.name]
+    run_id = to_mlflow.log_elsewhere(
+        tracking(bench),
+        experiment=bench.plan.key,
+        task=scored.task,
+        seeds=scored.predictions.seeds,
+        metrics=scored.score.metrics,
+        seed_metrics=scored.score.seed_metrics,
+        samples=scored.samples and scored.samples["by_horizon"],
+        tags={
+            "fingerprint": bench.plan.fingerprint(Unit(SCORED, request.name)),
+            "predictions_sha256": asked["sha256"],
+            "training": scored.held_out.words,
+            "seen_in_training": {True: "true", False: "false", None: "unknown"}[scored.held_out.seen],
+        },
+        artifacts=[draft / "error_by_horizon.png"],
+    )
     return Outcome(
         {
             **summary,
-            "asked": bench.plan.asked[request.name],
+            "asked": asked,
+            "mlflow_run_id": run_id,
             "observations": request.observations or ELSEWHERE,
             "split_hash": bench.split.hash,
             "file": str(request.predictions),

@@ -28,7 +28,7 @@ CODE_VERSIONS = {
     "trained_policy": "1",
     "predictions": "2",
     "rollouts": "1",
-    "scored_predictions": "1",
+    "scored_predictions": "2",
     "benchmark_table": "4",
     "benchmark_report": "5",
     "mcap_log": "1",

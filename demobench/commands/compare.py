@@ -43,7 +43,7 @@ class Address:
 class Entry:
     """One result to be compared, and what must be equal for that.
 
-    fingerprint, mlflow_run_id   either of them, or its beginning, is what `@run` pins; what was predicted elsewhere has no run
+    fingerprint, mlflow_run_id   either of them, or its beginning, is what `@run` pins
     rollouts                     closed-loop results, or None
     unit                         of the errors, where all action columns share one
     steps                        of training; None where nobody here trained it
@@ -63,7 +63,7 @@ class Entry:
     protocol: "Protocol"
     steps: int | None
     fingerprint: str
-    mlflow_run_id: str | None
+    mlflow_run_id: str
     seen: bool | None = False
 
     @property
@@ -233,16 +233,16 @@ def _load(plan: "Plan", variant: Variant, observations: str) -> Entry:
         protocol=plan.experiment.protocol,
         steps=None if elsewhere else plan.experiment.steps,
         fingerprint=plan.fingerprint(predictions),
-        mlflow_run_id=trained["mlflow_run_id"] if trained else None,
+        mlflow_run_id=(trained or made(predictions).summary)["mlflow_run_id"],
         seen=made(predictions).summary["seen_in_training"] if elsewhere else False,
     )
 
 
 def _check_pin(address: Address, entry: Entry) -> None:
-    if not any(name.startswith(address.pin) for name in (entry.fingerprint, entry.mlflow_run_id) if name):
+    if not any(name.startswith(address.pin) for name in (entry.fingerprint, entry.mlflow_run_id)):
         raise StoreError(
             f"The store no longer holds '{address.text}'. What it holds of {entry.address} is the result "
-            f"{entry.fingerprint}{f' (MLflow run {entry.mlflow_run_id})' if entry.mlflow_run_id else ''}."
+            f"{entry.fingerprint} (MLflow run {entry.mlflow_run_id})."
         )
 
 
@@ -424,6 +424,8 @@ def _footnotes(verdicts: Sequence["Comparison"], family: int, entries: Sequence[
             "success: a difference above zero is better; exact McNemar, one network of each (seed 0 of fold 0)."
         )
     if len(entries) <= 4:
-        lines += [f"{e.address}@{e.fingerprint}  {f'MLflow run {e.mlflow_run_id}' if e.mlflow_run_id else 'predicted elsewhere'}"
-                  for e in entries]  # fmt: skip
+        lines += [
+            f"{e.address}@{e.fingerprint}  MLflow run {e.mlflow_run_id}{', predicted elsewhere' if e.is_elsewhere else ''}"
+            for e in entries
+        ]
     return lines

@@ -4,7 +4,7 @@ What belongs here: from the file to `Predictions`, errors and metrics. What does
 (`checks`), comparing it (`pairing`).
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +32,13 @@ ELSEWHERE = "elsewhere"
 class Scored:
     """Predictions from elsewhere with their score.
 
+    task       as a policy of ours would have had it
     held_out   which episodes are scored, and what is known of the training
-    samples    scores of the samples at the first step (JSON-able), None where there is one
+    samples    scores of the samples at every step (JSON-able), None where there is one
     warnings   what looks wrong without keeping them from being scored
     """
 
+    task: PolicyTask
     predictions: Predictions
     score: Score
     held_out: HeldOut
@@ -95,7 +97,7 @@ def score_file(
     task = _task(name, predictions, held_out, demos, semantics, split, experiment)
     samples = _score_samples(answers, keep, held_out, demos, circular) if answers.actions.shape[1] > 1 else None
     warnings = (*answers.notes, *faults.warn)
-    return Scored(predictions, score_task(task, predictions), held_out, samples, warnings)
+    return Scored(task, predictions, score_task(task, predictions), held_out, samples, warnings)
 
 
 def _task(
@@ -108,27 +110,55 @@ def _task(
         for number, train in enumerate(held_out.train)
     ]
     variant = Variant(name, name, EXTERNAL, int(predictions.actions.shape[2]))
-    seen = experiment.observation_sets[0]
+    sets = {observation_set.name: observation_set for observation_set in experiment.observation_sets}
+    # Which set it is decides nothing here; hold-still, which is scored beside it, needs one.
+    seen = sets.get(predictions.observations) or replace(experiment.observation_sets[0], name=ELSEWHERE)
     return PolicyTask(demos, semantics, Split(tuple(folds), split.seed, split.hash), seen, variant, experiment)
+
+
+SAMPLE_SCORES = ("energy", "of_mean", "of_one")
+"""What `score_samples` gives."""
 
 
 def _score_samples(
     answers: Answers, keep: np.ndarray, held_out: HeldOut, demos: Demonstrations, circular: np.ndarray
 ) -> dict[str, Any]:
-    """The fair energy score of the first actions' samples, beside what their mean and one of them are worth.
+    """The fair energy score of the samples at every step of the chunk, beside what their mean and one of them are worth; with
+    intervals at the first action, and one second ahead where the chunk reaches so far.
 
     Distances are Euclidean over action columns; where their units differ, in deviations of the recorded column.
     """
-    anchors = answers.anchors[keep]
+    anchors, (_, count, _, steps, _) = answers.anchors[keep], answers.actions.shape
     recorded = demos.columns[ACTION][anchors]
     mixed = len(set(demos.features[ACTION].units)) > 1
     scale = np.where(recorded.std(axis=0) > 0, recorded.std(axis=0), np.nan) if mixed else None
-    scores = asdict(score_samples(answers.actions[:, :, keep, 0], recorded, circular=circular, scale=scale))
-    row = np.searchsorted(held_out.episodes, demos.episode_of_frame[anchors])
+    episode = demos.episode_of_frame[anchors]
+    ends, row = demos.episode_starts[episode + 1], np.searchsorted(held_out.episodes, episode)
+    one_second = round(demos.fps)
+    found: dict[str, Any] = {"count": int(count), "in_deviations": mixed, "at_one_second": None}
+    by_horizon: dict[str, list[float]] = {name: [] for name in SAMPLE_SCORES}
+    for horizon in range(steps):
+        inside = np.flatnonzero(anchors + horizon < ends)
+        if not len(inside):
+            break
+        samples = answers.actions[:, :, np.flatnonzero(keep)[inside], horizon]
+        scores = score_samples(
+            samples, demos.columns[ACTION][anchors[inside] + horizon], circular=circular, scale=scale
+        )
+        means = {name: _mean_over_episodes(getattr(scores, name), row[inside], held_out) for name in SAMPLE_SCORES}
+        for name, mean in means.items():
+            by_horizon[name].append(mean["value"])
+        if horizon == 0:
+            found |= means
+        elif horizon == one_second:
+            found["at_one_second"] = means
+    return found | {"by_horizon": by_horizon}
+
+
+def _mean_over_episodes(values: np.ndarray, row: np.ndarray, held_out: HeldOut) -> dict[str, Any]:
+    """The mean of [S, m] values over the episodes that have some, each counting once, with its interval."""
     counts = np.bincount(row, minlength=len(held_out.episodes))
-    found: dict[str, Any] = {"count": int(answers.actions.shape[1]), "in_deviations": mixed}
-    for name, values in scores.items():
-        of_episode = np.stack([np.bincount(row, one, minlength=len(counts)) / counts for one in values])
-        mean = estimate_mean(of_episode, fold=held_out.fold)
-        found[name] = {"value": mean.value, "interval": None if mean.interval is None else list(mean.interval)}
-    return found
+    there = counts > 0
+    of_episode = np.stack([np.bincount(row, one, minlength=len(counts))[there] / counts[there] for one in values])
+    mean = estimate_mean(of_episode, fold=held_out.fold[there])
+    return {"value": mean.value, "interval": None if mean.interval is None else list(mean.interval)}

@@ -110,13 +110,19 @@ def elsewhere_words(table: Table) -> list[str]:
         found.append(f"{row['policy']}: {row['training']}")
         found += [f"{row['policy']}: {warning}" for warning in row["warnings"]]
         if row["samples"]:
-            energy, one = (row["samples"][name]["value"] for name in ("energy", "of_one"))
             unit = " deviations" if row["samples"]["in_deviations"] else dataset_unit(table)
+            later = row["samples"]["at_one_second"]
             found.append(
-                f"{row['policy']}: errors are of the mean of {row['samples']['count']} samples; one sample is {show(one)}{unit} "
-                f"off (L2), fair energy score {show(energy)}"
+                f"{row['policy']}: errors are of the mean of {row['samples']['count']} samples; at the first action "
+                f"{_samples_words(row['samples'], unit)}{f'; one second ahead {_samples_words(later, unit)}' if later else ''}"
             )
     return found
+
+
+def _samples_words(scores: Mapping[str, Any], unit: str) -> str:
+    """What one sample and all of them are worth at one horizon."""
+    energy, one = (scores[name]["value"] for name in ("energy", "of_one"))
+    return f"one sample is {show(one)}{unit} off (L2), fair energy score {show(energy)}{unit}"
 
 
 def champion(table: Table) -> str | None:

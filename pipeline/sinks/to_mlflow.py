@@ -91,8 +91,52 @@ def log_training(
     return run_id
 
 
-def _open_run(client: Any, uri: str, experiment: str, task: PolicyTask, tags: Mapping[str, str]) -> str:
-    """A new run with the parameters and tags that people compare and search by."""
+def log_elsewhere(
+    uri: str,
+    *,
+    experiment: str,
+    task: PolicyTask,
+    seeds: Sequence[int],
+    metrics: Mapping[str, Any],
+    seed_metrics: Sequence[Mapping[str, Any]],
+    samples: Mapping[str, Sequence[float]] | None,
+    tags: Mapping[str, str],
+    artifacts: Sequence[Path] = (),
+) -> str:
+    """A run of its own for predictions that were made elsewhere, tagged `demobench.external`: the metrics of every other run
+    under the same names, seeds as nested runs; scores of samples, where there are some, as `samples_energy`, … by horizon.
+
+    Returns the run's id.
+    """
+    with _client(uri) as client:
+        changes = {"seeds": len(seeds), "steps": "unknown"}
+        if task.observation_set not in task.experiment.observation_sets:
+            changes["features"] = "unknown"
+        run_id = _open_run(client, uri, experiment, task, {"external": "true", **tags}, changes)
+        experiment_id = client.get_run(run_id).info.experiment_id
+        name = f"{task.variant.name}/{task.observation_set.name}"
+        for seed, values in zip(seeds, seed_metrics, strict=True) if len(seeds) > 1 else ():
+            child = _child(client, experiment_id, run_id, f"{name}/seed_{seed}", seed)
+            _send(client, child, _series(values))
+            client.set_terminated(child)
+        _send(client, run_id, _series(metrics))
+        if samples:
+            _send(client, run_id, _series({f"samples_{name}": values for name, values in samples.items()}))
+        for path in artifacts:
+            client.log_artifact(run_id, str(path))
+        client.set_terminated(run_id)
+    return run_id
+
+
+def _open_run(
+    client: Any,
+    uri: str,
+    experiment: str,
+    task: PolicyTask,
+    tags: Mapping[str, str],
+    changes: Mapping[str, Any] | None = None,
+) -> str:
+    """A new run with the parameters and tags that people compare and search by; `changes` to the parameters of the task."""
     from mlflow.entities import Param, RunTag
 
     variant = task.variant
@@ -109,6 +153,7 @@ def _open_run(client: Any, uri: str, experiment: str, task: PolicyTask, tags: Ma
         "steps": task.experiment.steps if variant.is_trained else 0,
         "folds": len(task.split.folds),
         "history": task.experiment.history,
+        **(changes or {}),
     }
     about = {
         "content_hash": task.demos.content_hash,

@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 
 import dagster as dg
+import mlflow
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -19,6 +20,7 @@ from pipeline.config import BASELINES
 from pipeline.errors import ConfigError
 from pipeline.lerobot_format.saved import load_demonstrations
 from pipeline.predict import load_predictions
+from pipeline.sinks.to_mlflow import tracking_uri
 from pipeline.split import load_split
 from pipeline.statistics.metrics import load_errors
 from pipeline.store import Store
@@ -127,6 +129,37 @@ def test_the_ui_shows_it_and_it_is_no_part_of_a_benchmark(copied, scored):
     metadata = event.asset_materialization.metadata
     assert "6 episodes that it was not trained on (split.json, a split of 2 folds)" in metadata["scores"].value
     assert "data:image/png" in metadata["error_by_horizon_sent"].value
+
+
+def test_mlflow_has_a_run_of_it_with_the_metrics_of_every_other_run(copied, scored):
+    """Equal predictions: the metrics that scoring gives the policy's own run are those of the row from elsewhere."""
+    client = mlflow.MlflowClient(tracking_uri("sqlite", copied.store.root))
+    experiment = client.get_experiment_by_name("tiny").experiment_id
+    runs = client.search_runs([experiment], "tags.`demobench.external` = 'true'", max_results=10)
+    (run,) = runs
+    said = copied.store.made(copied.plan().folder(Unit(SCORED, "sent"))).summary
+    assert run.info.run_id == said["mlflow_run_id"]
+    assert (run.info.run_name, run.info.status) == ("sent/state", "FINISHED")
+    assert run.data.params | {"method": "external", "seeds": "2", "steps": "unknown"} == run.data.params
+    tags = {
+        name: run.data.tags[f"demobench.{name}"] for name in ("seen_in_training", "predictions_sha256", "split_hash")
+    }
+    assert tags == {
+        "seen_in_training": "false",
+        "predictions_sha256": said["asked"]["sha256"],
+        "split_hash": said["split_hash"],
+    }
+    ours = copied.store.made(copied.plan().folder(Unit("mlp_k04/trained_policy", "state"))).summary["mlflow_run_id"]
+    of_ours = client.get_run(ours).data.metrics
+    costs = {"train_s", "parameters"}
+    assert set(run.data.metrics) == set(of_ours) - costs
+    assert {name: run.data.metrics[name] for name in run.data.metrics} == pytest.approx(
+        {name: of_ours[name] for name in run.data.metrics}
+    )
+    nested = client.search_runs([experiment], f"tags.`mlflow.parentRunId` = '{run.info.run_id}'")
+    assert sorted(child.info.run_name for child in nested) == ["sent/state/seed_0", "sent/state/seed_1"]
+    assert all(child.data.metrics["first_step_mae"] > 0 for child in nested)
+    assert [one.path for one in client.list_artifacts(run.info.run_id)] == ["error_by_horizon.png"]
 
 
 def test_without_a_name_it_shows_what_is_there(copied, scored):

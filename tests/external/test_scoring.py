@@ -81,26 +81,44 @@ def test_a_fold_alone_gives_that_folds_errors(ours, tmp_path):
     assert found.score.errors.fold.tolist() == [0] * len(test)
 
 
-def test_samples_are_scored_by_their_mean_and_the_energy_score(place, tmp_path):
-    task = task_of(place.demos, "mlp_k04")
-    anchors = anchors_of(place.demos, HISTORY)
-    recorded = place.demos.columns[ACTION][anchors]
-    samples = recorded + np.random.default_rng(2).normal(size=(1, 6, *recorded.shape)).astype(np.float32)
+def test_samples_are_scored_by_their_mean_and_the_energy_score_at_every_step(place, tmp_path):
+    """Chunks of 12 steps at 10 frames a second: the first action, one second ahead, and every step between."""
+    task, steps = task_of(place.demos, "mlp_k04"), 12
+    demos, anchors = place.demos, anchors_of(place.demos, HISTORY)
+    episode = demos.episode_of_frame[anchors]
+    frames = anchors[:, None] + np.arange(steps)
+    inside = frames < demos.episode_starts[episode + 1][:, None]
+    recorded = demos.columns[ACTION][np.minimum(frames, demos.frames - 1)]
+    samples = recorded + np.random.default_rng(2).normal(size=(6, *recorded.shape)).astype(np.float32)
+    samples[:, ~inside] = 9e3  # what lies past the end of an episode is nobody's business
     rows = place.rows(steps=1).but(fold=None)
     several = {name: values * 6 for name, values in rows.columns.items()}
-    several |= {"action": samples[0].reshape(-1, 1, 3).tolist(), "sample": np.repeat(range(6), len(anchors)).tolist()}
+    several |= {"action": samples.reshape(-1, steps, 3).tolist(), "sample": np.repeat(range(6), len(anchors)).tolist()}
     found = score_rows(Rows(several), task, tmp_path / "p.parquet", training=None)
     assert found.samples["count"] == 6
     assert found.samples["in_deviations"] is False
-    slow = score_samples(samples, recorded)
-    episode = place.demos.episode_of_frame[anchors]
     for name in ("energy", "of_mean", "of_one"):
-        by_hand = np.mean([getattr(slow, name)[0, episode == e].mean() for e in range(6)])
-        assert found.samples[name]["value"] == pytest.approx(by_hand, rel=1e-6)
-        low, high = found.samples[name]["interval"]
-        assert low < by_hand < high
-    np.testing.assert_allclose(found.predictions.actions[0, :, 0], samples[0].mean(axis=0), atol=1e-5)
+        by_hand = []
+        for k in range(steps):
+            slow = getattr(score_samples(samples[None, :, inside[:, k], k], recorded[inside[:, k], k]), name)[0]
+            by_hand.append(np.mean([slow[episode[inside[:, k]] == e].mean() for e in range(6)]))
+        np.testing.assert_allclose(found.samples["by_horizon"][name], by_hand, rtol=1e-6)
+        for scores, value in ((found.samples, by_hand[0]), (found.samples["at_one_second"], by_hand[10])):
+            assert scores[name]["value"] == pytest.approx(value, rel=1e-6)
+            low, high = scores[name]["interval"]
+            assert low < value < high
+    np.testing.assert_allclose(found.predictions.actions[0, :, 0], samples[:, :, 0].mean(axis=0), atol=1e-5)
     assert found.score.metrics["first_step_l2"] == pytest.approx(found.samples["of_mean"]["value"], rel=1e-6)
+
+
+def test_samples_of_a_short_chunk_have_nothing_one_second_ahead(place, tmp_path):
+    rows = place.rows(steps=2).but(fold=None)
+    two = {name: values * 2 for name, values in rows.columns.items()} | {
+        "sample": np.repeat((0, 1), len(rows.columns["seed"]))
+    }
+    found = score_rows(Rows(two), task_of(place.demos, "mlp_k04"), tmp_path / "p.parquet", training=None)
+    assert found.samples["at_one_second"] is None
+    assert len(found.samples["by_horizon"]["energy"]) == 2
 
 
 def test_a_misaligned_file_is_refused_with_its_name(ours, tmp_path):
