@@ -83,10 +83,10 @@ def check_alignment(anchors: np.ndarray, actions: np.ndarray, demos: Demonstrati
     pair = _Pair(first[:, use], recorded[:, use], recorded[:, use].std(axis=0), names, units)
     refuse = _permuted(pair) or _normalised(pair, demos, use) or _scaled(pair)
     refuse = refuse or _early(pair, anchors, demos, use) or _mixed_up(pair, anchors, demos, use)
-    warn = (
-        [] if refuse else [*_exact(pair), *_offset(pair), *_looks_normalised(pair), *_late(pair, anchors, demos, use)]
-    )
-    return Faults(tuple(refuse), tuple(warn))
+    if refuse:
+        return Faults(tuple(refuse), ())
+    warn = [*_exact(pair), *_offset(pair), *_looks_normalised(pair), *_looks_permuted(pair)]
+    return Faults((), (*warn, *_late(pair, anchors, demos, use)))
 
 
 def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -99,8 +99,26 @@ def _correlations(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _permuted(pair: _Pair) -> list[str]:
-    """Columns in another order. Every column that moved must correlate with its new place: one that merely resembles a
-    neighbour is not enough."""
+    """Columns in another order: in their new places they fit, in their own they do not."""
+    place, moved = _places(pair)
+    undone = pair.predicted.copy()
+    undone[:, place[moved]] = pair.predicted[:, moved]
+    new, own = (pair.error(predicted, pair.recorded)[moved] for predicted in (undone, pair.predicted))
+    if not moved.any() or (new > 1 - FITS).any() or (own < MUCH_BETTER * new).any():
+        return []
+    return [f"action columns are permuted: {_places_words(pair)}. Expected the order {', '.join(pair.names)}"]
+
+
+def _looks_permuted(pair: _Pair) -> list[str]:
+    """Columns that go with others more than with their own, and fit neither: a policy that learnt little does that as well."""
+    _, moved = _places(pair)
+    return [f"are action columns permuted? {_places_words(pair)}; but they fit no place"] if moved.any() else []
+
+
+def _places(pair: _Pair) -> tuple[np.ndarray, np.ndarray]:
+    """[C] the column that each correlates with in the best assignment, and [C] bool, those that moved for certain. Every one
+    must correlate with its new place: one that merely resembles a neighbour is not enough.
+    """
     from scipy.optimize import linear_sum_assignment
 
     correlation = _correlations(pair.predicted, pair.recorded)
@@ -111,15 +129,17 @@ def _permuted(pair: _Pair) -> list[str]:
         & (correlation[columns, place] >= CORRELATED)
         & (correlation[columns, place] - correlation.diagonal() >= LESS_CORRELATED)
     )
-    moved &= np.isin(place, columns[moved])  # whole cycles only
-    if not moved.any():
-        return []
-    pairs = ", ".join(
+    return place, moved & np.isin(place, columns[moved])  # whole cycles only
+
+
+def _places_words(pair: _Pair) -> str:
+    place, moved = _places(pair)
+    correlation = _correlations(pair.predicted, pair.recorded)
+    return ", ".join(
         f"{pair.names[i]} holds {pair.names[place[i]]} (correlation {correlation[i, place[i]]:.2f}, with its own "
         f"{correlation[i, i]:.2f})"
-        for i in columns[moved]
+        for i in np.flatnonzero(moved)
     )
-    return [f"action columns are permuted: {pairs}. Expected the order {', '.join(pair.names)}"]
 
 
 def _normalised(pair: _Pair, demos: Demonstrations, use: np.ndarray) -> list[str]:

@@ -140,6 +140,10 @@ WARNED = {
         ["off by a constant: a1 by +89.97", "Is zero elsewhere"],
     ),
     "the recording itself": (lambda b: b.recorded, ["exactly the one recorded"]),
+    "columns that go with others and fit nowhere": (
+        lambda b: b.mean + 3 * (b.recorded - b.mean)[:, [1, 0, 2]] + 2 * b.deviation,
+        ["are action columns permuted? a0 holds a1", "they fit no place"],
+    ),
     "noise around zero": (lambda b: b.random.normal(size=b.recorded.shape), ["mean 0 and deviation 1"]),
 }
 
