@@ -263,6 +263,7 @@ def split(
     demobench score tape --write-anchors anchors.parquet         the rows to fill in\n
     demobench score tape my_act.parquet --trained-on fold0.json  score them\n
     demobench score tape --lerobot outputs/train/act --lerobot-python lerobot-env/bin/python\n
+    demobench score tape --lerobot hub:me/act_tape@main --lerobot-python lerobot-env/bin/python\n
     demobench score tape --remove my_act"""
 )
 def score(
@@ -287,7 +288,11 @@ def score(
         typer.Option(help="What it was trained on: a split, a JSON list of episodes, or LeRobot's train_config.json."),
     ] = None,
     lerobot: Annotated[
-        Path | None, typer.Option(metavar="CHECKPOINT_DIR", help="Ask a LeRobot checkpoint instead of reading a file.")
+        str | None,
+        typer.Option(
+            metavar="CHECKPOINT",
+            help="Ask a LeRobot checkpoint instead of reading a file: a folder, or hub:owner/name[@revision].",
+        ),
     ] = None,
     lerobot_python: Annotated[
         Path | None, typer.Option(metavar="PATH", help="The Python of the environment that has LeRobot.")

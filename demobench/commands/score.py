@@ -16,7 +16,7 @@ from rich.markup import escape
 
 from demobench.commands.run import check_source, collect, materialise, show
 from demobench.commands.session import Session, open_dataset, open_session, write_json_to
-from pipeline.errors import ConfigError, NotApplicableError, StoreError, did_you_mean
+from pipeline.errors import ConfigError, StoreError, did_you_mean
 from pipeline.experiment import Target
 from pipeline.store import write_json
 
@@ -39,9 +39,14 @@ class Opened:
 
 @dataclass(frozen=True)
 class LeRobot:
-    """A checkpoint and how it is asked; `features`: a feature of the checkpoint → the data set's feature it is shown."""
+    """A checkpoint and how it is asked.
+
+    checkpoint  its folder; `name` what its row is called unless told otherwise
+    features    a feature of the checkpoint → the data set's feature it is shown
+    """
 
     checkpoint: Path
+    name: str
     python: Path
     device: str
     features: Mapping[str, str]
@@ -56,7 +61,7 @@ def run_score(
     name: str | None,
     observations: str | None,
     trained_on: Path | None,
-    lerobot: Path | None,
+    lerobot: str | None,
     lerobot_python: Path | None,
     device: str,
     features: Sequence[str],
@@ -79,9 +84,7 @@ def run_score(
     if len(given) > 1:
         raise ConfigError(f"{' and '.join(given)} are different things to do. Ask for one at a time.")
     if (lerobot is None) != (lerobot_python is None):
-        raise ConfigError(
-            "--lerobot CHECKPOINT_DIR and --lerobot-python PATH (the Python that has LeRobot) go together."
-        )
+        raise ConfigError("--lerobot CHECKPOINT and --lerobot-python PATH (the Python that has LeRobot) go together.")
     if fold is not None and write_anchors is None:
         raise ConfigError("--fold says which anchors --write-anchors writes; scoring takes the fold from --trained-on.")
     opened = Opened(dataset, session, *open_dataset(dataset, session))
@@ -94,7 +97,8 @@ def run_score(
     elif predictions is not None:
         _score(opened, _request(opened, predictions, name, trained_on, observations), json_to)
     else:
-        ask = LeRobot(lerobot, lerobot_python, device, _features(features, opened.demos))
+        folder, called = _checkpoint(lerobot, session)
+        ask = LeRobot(folder, called, lerobot_python, device, _features(features, opened.demos))
         _score(opened, _ask_lerobot(opened, ask, name, trained_on, observations), json_to)
 
 
@@ -163,13 +167,9 @@ def _ask_lerobot(
     experiment, demos, store = opened.target.experiment, opened.demos, opened.session.store
     require_strict(experiment.protocol)
     checkpoint = ask.checkpoint
-    if not checkpoint.is_dir():
-        raise ConfigError(
-            f"The checkpoint {checkpoint} is no folder. Name the pretrained_model folder, or that of its run."
-        )
     trained_on = trained_on or lerobot_training_file(checkpoint)
     folder = store.ensure().dataset(opened.target.key) / ".elsewhere"
-    request = _request(opened, folder, name or _checkpoint_name(checkpoint), trained_on, observations)
+    request = _request(opened, folder, name or ask.name, trained_on, observations)
     request = replace(request, predictions=folder / f"{request.name}.parquet")
     episodes = _episodes_to_ask(opened, trained_on)
     stamp = {
@@ -215,6 +215,29 @@ def _features(pairs: Sequence[str], demos: "Demonstrations") -> dict[str, str]:
     return found
 
 
+def _checkpoint(text: str, session: Session) -> tuple[Path, str]:
+    """The folder of a checkpoint, downloaded where it is on the Hub, and what to call its row.
+
+    Raises:
+        ConfigError: it is no folder; HubError where the Hub has no such checkpoint.
+    """
+    if text.startswith("hub:"):
+        from pipeline.lerobot_format.hub import fetch_checkpoint
+
+        copy = fetch_checkpoint(text.removeprefix("hub:"))
+        for warning in copy.warnings:
+            session.console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
+        session.console.print(f"{escape(text)}: commit {copy.commit}", soft_wrap=True)
+        return copy.folder, _slug(text.split("@")[0].rpartition("/")[2])
+    folder = Path(text)
+    if not folder.is_dir():
+        on_the_hub = f" For a checkpoint on the Hub write hub:{text}." if re.fullmatch(r"[\w.-]+/[\w.-]+", text) else ""
+        raise ConfigError(
+            f"The checkpoint {text} is no folder. Name the pretrained_model folder, or that of its run.{on_the_hub}"
+        )
+    return folder, _checkpoint_name(folder)
+
+
 def _checkpoint_name(checkpoint: Path) -> str:
     """The name of the run that a checkpoint belongs to: what stands before `checkpoints` in its path, else its folder's."""
     parts = checkpoint.absolute().parts
@@ -257,16 +280,12 @@ def _read_stamp(predictions: Path) -> Any:
 
 def _predict(opened: Opened, ask: LeRobot, anchors: Path, out: Path) -> None:
     from demobench.progress import counting_bar
-    from pipeline.inspection.videos import local_folder
-    from pipeline.lerobot_bridge import predict_with_lerobot
+    from pipeline.lerobot_bridge import predict_with_lerobot, sees_pictures
+    from pipeline.lerobot_format.read import folder_of
 
     session = opened.session
-    folder = local_folder(opened.target.experiment.dataset.source, session.config_dir)
-    if folder is None:
-        raise NotApplicableError(
-            f"LeRobot reads data sets from folders, and '{opened.target.key}' is at {opened.target.experiment.dataset.source}. "
-            "Name a folder that holds it."
-        )
+    source, commit = opened.target.experiment.dataset.source, opened.demos.revision
+    folder = folder_of(source, session.config_dir, commit=commit, videos=sees_pictures(ask.checkpoint))
     with counting_bar(session.console, "anchors", 1) as count:
         facts = predict_with_lerobot(
             ask.checkpoint,

@@ -97,6 +97,17 @@ def predict_with_lerobot(
         return _facts(process.returncode, last, log)
 
 
+def sees_pictures(checkpoint: Path) -> bool:
+    """Whether a checkpoint's config.json names a camera among its inputs; False where there is none to read."""
+    for inside in ("", "pretrained_model", "checkpoints/last/pretrained_model"):
+        try:
+            config = json.loads((checkpoint / inside / "config.json").read_text(encoding="utf-8"))
+            return any(feature.get("type") == "VISUAL" for feature in config["input_features"].values())
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            continue
+    return False
+
+
 @contextmanager
 def _running(command: list[str], log: Path, environment: dict[str, str]) -> Iterator[subprocess.Popen[str]]:
     """A process that is stopped when the block is left early, by Ctrl-C for one."""

@@ -1,4 +1,4 @@
-"""Data sets on the Hugging Face Hub: a revision becomes a commit, and a commit a folder on this machine.
+"""Data sets and checkpoints on the Hugging Face Hub: a revision becomes a commit, and a commit a folder on this machine.
 
 What belongs here: names, the cache, the network and its failures. What does not: what is in the folder (read.py).
 Tokens stay inside `huggingface_hub`; no message here repeats what a server or a header said.
@@ -21,7 +21,6 @@ from pipeline.errors import HubError
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
-KIND = "dataset"
 TIMEOUT_S = 15.0
 """Longest wait for one answer of the Hub."""
 ATTEMPTS, FIRST_WAIT_S = 3, 1.0
@@ -33,6 +32,29 @@ _REPOSITORY = re.compile(r"[A-Za-z0-9_][\w.-]{0,95}/[A-Za-z0-9_][\w.-]{0,95}", r
 _REVISION = re.compile(r"[\w][\w./+-]{0,199}", re.ASCII)
 _ADDRESS = re.compile(r"https?://([^/@\s]*@)?[\w.-]+(:\d{1,5})?(/\S*)?", re.ASCII)
 _COMMIT = re.compile(r"[0-9a-f]{40}")
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What a repository holds.
+
+    name     as the library calls it, and in the names of the cache's folders
+    words    for people          address  before its name in the Hub's addresses
+    proof    a file without which it is not one
+    """
+
+    name: str
+    words: str
+    address: str
+    proof: str
+
+
+DATA_SET = _Kind("dataset", "data set", "datasets/", "meta/info.json")
+CHECKPOINT = _Kind("model", "checkpoint", "", "config.json")
+CHECKPOINT_FILES = (
+    "config.json", "train_config.json", "model.safetensors", "policy_preprocessor*", "policy_postprocessor*",
+)  # fmt: skip
+"""What LeRobot puts there when it pushes a policy; nothing else is downloaded."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +77,7 @@ class _OutOfReach(Exception):
         self.passing = passing
 
 
-def parse_repository(text: str) -> tuple[str, str | None]:
+def parse_repository(text: str, kind: _Kind = DATA_SET) -> tuple[str, str | None]:
     """`owner/name[@revision]` → the repository and the revision, None for the newest.
 
     Raises:
@@ -64,7 +86,7 @@ def parse_repository(text: str) -> tuple[str, str | None]:
     repository, at, revision = text.partition("@")
     if not _REPOSITORY.fullmatch(repository) or ".." in repository or (at and not _is_revision(revision)):
         raise HubError(
-            f"'hub:{text}' does not name a data set on the Hub. Write hub:owner/name, or hub:owner/name@revision with "
+            f"'hub:{text}' does not name a {kind.words} on the Hub. Write hub:owner/name, or hub:owner/name@revision with "
             "a branch, a tag or a commit."
         )
     return repository, revision or None
@@ -84,17 +106,35 @@ def fetch(text: str, *, videos: bool = False) -> HubCopy:
         HubError: there is no such data set or revision, access is refused, no room, or the Hub is out of reach and
             there is no whole copy in the cache.
     """
-    repository, revision = parse_repository(text)
-    patterns = ["meta/*", "data/*", *(["videos/*"] if videos else [])]
+    return _fetch(text, DATA_SET, ["meta/*", "data/*", *(["videos/*"] if videos else [])])
+
+
+def fetch_checkpoint(text: str) -> HubCopy:
+    """The policy that LeRobot pushed to `owner/name[@revision]`, likewise.
+
+    Raises:
+        HubError: as `fetch`.
+    """
+    copy = _fetch(text, CHECKPOINT, list(CHECKPOINT_FILES))
+    if not (copy.folder / CHECKPOINT.proof).is_file():
+        raise HubError(
+            f"'hub:{text}' holds no {CHECKPOINT.proof}, so it is no checkpoint that LeRobot saved. Name the repository that "
+            "`lerobot-train` pushed its policy to."
+        )
+    return copy
+
+
+def _fetch(text: str, kind: _Kind, patterns: list[str]) -> HubCopy:
+    repository, revision = parse_repository(text, kind)
     pinned = revision is not None and _COMMIT.fullmatch(revision)
-    if pinned and (copy := _cached(repository, revision, patterns, listed=True)):
+    if pinned and (copy := _cached(kind, repository, revision, patterns, listed=True)):
         return copy
     try:
-        commit = _ask(repository, revision, patterns, TIMEOUT_S)
-        return _download(repository, revision, commit, patterns)
+        commit = _ask(kind, repository, revision, patterns, TIMEOUT_S)
+        return _download(kind, repository, revision, commit, patterns)
     except _OutOfReach as reason:
         problem = f"The Hub ({_host()}) is out of reach ({reason})"
-    copy = _cached(repository, revision, patterns, listed=False)
+    copy = _cached(kind, repository, revision, patterns, listed=False)
     if copy is None:
         raise HubError(
             f"{problem}, and there is no whole copy of '{text}' on this machine. "
@@ -110,20 +150,21 @@ def current_commit(repository: str, revision: str | None) -> str | None:
     if revision and _COMMIT.fullmatch(revision):
         return revision
     try:
-        return _ask(repository, revision, None, TIMEOUT_S / 3)
+        return _ask(DATA_SET, repository, revision, None, TIMEOUT_S / 3)
     except (_OutOfReach, HubError):
         return _cached_commit(repository, revision)
 
 
-def _ask(repository: str, revision: str | None, patterns: list[str] | None, timeout: float) -> str:
+def _ask(kind: _Kind, repository: str, revision: str | None, patterns: list[str] | None, timeout: float) -> str:
     """The commit of a revision by the Hub; with `patterns`, after a look at whether its files fit on the disk."""
-    with _failures_of(repository, revision):
-        info = _api().dataset_info(repository, revision=revision, timeout=timeout, files_metadata=patterns is not None)
+    with _failures_of(kind, repository, revision):
+        listed = {"timeout": timeout, "files_metadata": patterns is not None}
+        info = _api().repo_info(repository, repo_type=kind.name, revision=revision, **listed)
     if not isinstance(info.sha, str) or not _COMMIT.fullmatch(info.sha):
         raise HubError(f"The Hub ({_host()}) gave no commit for '{repository}'. Is HF_ENDPOINT a Hub?")
     if patterns is not None:
         wanted = tuple(pattern.rstrip("*") for pattern in patterns)
-        here = _cache_folder() / f"datasets--{repository.replace('/', '--')}" / "snapshots" / info.sha
+        here = _cache_folder() / f"{kind.name}s--{repository.replace('/', '--')}" / "snapshots" / info.sha
         files = [file for file in info.siblings or [] if file.rfilename.startswith(wanted)]
         _check_room(repository, sum(file.size or 0 for file in files if not (here / file.rfilename).exists()))
     return info.sha
@@ -139,7 +180,7 @@ def _check_room(repository: str, size: int) -> None:
         )
 
 
-def _download(repository: str, revision: str | None, commit: str, patterns: list[str]) -> HubCopy:
+def _download(kind: _Kind, repository: str, revision: str | None, commit: str, patterns: list[str]) -> HubCopy:
     """Download what is not in the cache yet, in a few attempts, each going on from what is there; check what came.
 
     The commit is the one whose files came, should a branch move meanwhile: all of them are of one commit.
@@ -147,7 +188,7 @@ def _download(repository: str, revision: str | None, commit: str, patterns: list
     began, damaged = time.time(), []
     for attempt in range(ATTEMPTS):
         try:
-            copy = _download_once(repository, revision, commit, patterns)
+            copy = _download_once(kind, repository, revision, commit, patterns)
         except _OutOfReach as reason:
             if not reason.passing or attempt == ATTEMPTS - 1:
                 raise
@@ -157,7 +198,7 @@ def _download(repository: str, revision: str | None, commit: str, patterns: list
         if not damaged:
             return copy
         for file in damaged:
-            file.resolve().unlink()
+            file.resolve().unlink(missing_ok=True)  # equal files share their bytes
             file.unlink()
     name = damaged[0].relative_to(copy.folder).as_posix()
     raise HubError(
@@ -166,14 +207,14 @@ def _download(repository: str, revision: str | None, commit: str, patterns: list
     )
 
 
-def _download_once(repository: str, revision: str | None, commit: str, patterns: list[str]) -> HubCopy:
+def _download_once(kind: _Kind, repository: str, revision: str | None, commit: str, patterns: list[str]) -> HubCopy:
     from huggingface_hub import snapshot_download
 
-    with _failures_of(repository, revision):
+    with _failures_of(kind, repository, revision):
         _api()  # bounds the session's waits
         folder = snapshot_download(
             repository,
-            repo_type=KIND,
+            repo_type=kind.name,
             revision=revision or "main",
             cache_dir=_cache_folder(),
             allow_patterns=patterns,
@@ -197,23 +238,23 @@ def _is_as_named(file: Path, began: float) -> bool:
     return digest.hexdigest() == bytes_.name
 
 
-def _cached(repository: str, revision: str | None, patterns: list[str], *, listed: bool) -> HubCopy | None:
+def _cached(kind: _Kind, repository: str, revision: str | None, patterns: list[str], *, listed: bool) -> HubCopy | None:
     """The copy in the cache, if it is whole. `listed` asks for proof: a list of the commit's files to compare with.
 
-    Without a list (a cache filled by other means) a copy counts as whole when it has its meta/info.json; reading it
-    will show what is missing.
+    Without a list (a cache filled by other means) a copy counts as whole when it has the file that proves what it is;
+    reading it will show what is missing.
     """
     from huggingface_hub import get_cached_repo_tree, snapshot_download
     from huggingface_hub.errors import CachedRepoTreeNotFoundError, IncompleteSnapshotError, LocalEntryNotFoundError
 
-    place = {"repo_type": KIND, "revision": revision or "main", "cache_dir": _cache_folder()}
+    place = {"repo_type": kind.name, "revision": revision or "main", "cache_dir": _cache_folder()}
     try:
         if listed:
             get_cached_repo_tree(repository, **place)
         folder = Path(snapshot_download(repository, local_files_only=True, allow_patterns=patterns, **place))
     except (CachedRepoTreeNotFoundError, IncompleteSnapshotError, LocalEntryNotFoundError, OSError):
         return None
-    return HubCopy(folder, folder.name) if (folder / "meta/info.json").exists() else None
+    return HubCopy(folder, folder.name) if (folder / kind.proof).exists() else None
 
 
 def _cached_commit(repository: str, revision: str | None) -> str | None:
@@ -223,7 +264,7 @@ def _cached_commit(repository: str, revision: str | None) -> str | None:
         return (
             _api()
             .resolve_revision(
-                repository, repo_type=KIND, revision=revision, cache_dir=_cache_folder(), local_files_only=True
+                repository, repo_type=DATA_SET.name, revision=revision, cache_dir=_cache_folder(), local_files_only=True
             )
             .resolved
         )
@@ -251,7 +292,7 @@ def _give_up_on_long_pauses(response: Any) -> None:
 
 
 @contextmanager
-def _failures_of(repository: str, revision: str | None) -> Iterator[None]:
+def _failures_of(kind: _Kind, repository: str, revision: str | None) -> Iterator[None]:
     """Failures of a request → `HubError` with what to do, or `_OutOfReach` where a copy in the cache may help."""
     from huggingface_hub import errors
 
@@ -261,12 +302,12 @@ def _failures_of(repository: str, revision: str | None) -> Iterator[None]:
         yield
     except errors.GatedRepoError:
         raise HubError(
-            f"'{repository}' asks its readers to accept terms. Do so at {_host()}/datasets/{repository}, then run "
+            f"'{repository}' asks its readers to accept terms. Do so at {_host()}/{kind.address}{repository}, then run "
             "`hf auth login`."
         ) from None
     except errors.RepositoryNotFoundError:
         raise HubError(
-            f"The Hub ({_host()}) shows no data set '{repository}'. "
+            f"The Hub ({_host()}) shows no {kind.words} '{repository}'. "
             "Check the name; if it is private, run `hf auth login`."
         ) from None
     except errors.RevisionNotFoundError:
@@ -277,7 +318,7 @@ def _failures_of(repository: str, revision: str | None) -> Iterator[None]:
     except errors.RemoteEntryNotFoundError:
         raise HubError(
             f"The Hub ({_host()}) lists a file of '{repository}' that it does not have. Give another revision, or ask whoever "
-            "keeps the data set to upload it again."
+            f"keeps the {kind.words} to upload it again."
         ) from None
     except errors.HfHubHTTPError as error:
         status = error.response.status_code

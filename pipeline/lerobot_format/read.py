@@ -246,6 +246,25 @@ def _path(source: str, config_dir: Path) -> Path:
     return folder
 
 
+def folder_of(source: str, config_dir: Path, *, commit: str | None, videos: bool) -> Path:
+    """The folder with a source's files, for programs that read folders: of an archive that of its unpacked copy, on the Hub
+    that of the copy in the cache (of `commit`, as it was read), with its videos where they are asked for.
+
+    Raises:
+        DatasetError: it cannot be had; HubError where the Hub is the reason.
+    """
+    if source.startswith(EMBEDDED):
+        from pipeline.embedded import embedded_folder
+
+        return embedded_folder(source.removeprefix(EMBEDDED))
+    if source.startswith(HUB):
+        from pipeline.lerobot_format.hub import fetch
+
+        repository = source.removeprefix(HUB).split("@")[0]
+        return fetch(f"{repository}@{commit}", videos=videos).folder
+    return source_folder(source, config_dir)
+
+
 def source_stamp(source: str, config_dir: Path) -> dict[str, Any]:
     """What makes a source stale, found without reading it: JSON-able, equal while nothing has changed.
 

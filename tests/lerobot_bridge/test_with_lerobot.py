@@ -1,7 +1,10 @@
 """LeRobot reads what is written here, and its checkpoints are asked as LeRobot would ask them. Slow: LeRobot is started."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -14,6 +17,7 @@ from pipeline.errors import PolicyError
 from pipeline.lerobot_bridge import CheckpointFacts, predict_with_lerobot
 from pipeline.types import ACTION, STATE
 from tests.lerobot_bridge.conftest import LENGTHS, TRAINED_ON, Run
+from tests.lerobot_format.hub_server import running_hub
 from tests.makers import tiny_recording, write_v2, write_v3
 
 pytestmark = pytest.mark.slow
@@ -207,3 +211,38 @@ def test_what_does_not_fit(act: Path, predict: Callable, tmp_path: Path, change:
     folder = write_v3(tmp_path / "set", recording)
     with pytest.raises(PolicyError, match=words):
         predict(act, folder, [change.get("anchor", (0, 0))], features=change.get("features"))
+
+
+def test_scored_in_one_command_with_the_checkpoint_and_the_data_set_on_the_hub(
+    act: Path, small: Path, lerobot_python: Path, tmp_path: Path
+) -> None:
+    """As a user meets it; then from a .zip of the data set and the run's folder: the same row."""
+    with running_hub() as hub:
+        commit = hub.push("me/act_small", act / "checkpoints/last/pretrained_model")
+        hub.push("me/small", small / "recorded")
+        environment = {name: value for name, value in os.environ.items() if name != "HF_HUB_OFFLINE"}
+        environment |= {
+            "HF_ENDPOINT": hub.url,
+            "HF_HOME": str(tmp_path / "hub"),
+            "XDG_CACHE_HOME": str(tmp_path / "cache"),
+        }
+
+        def score(dataset: str, checkpoint: str, *options: str) -> dict:
+            words = ["score", dataset, "--lerobot", checkpoint, "--lerobot-python", str(lerobot_python), "--json", "-"]
+            command = [sys.executable, "-m", "demobench.cli", *words, *options]
+            done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+            assert done.returncode == 0, done.stderr[-3000:]
+            assert "Traceback" not in done.stderr
+            (row,) = [row for row in json.loads(done.stdout)[0]["policies"] if row["method"] == "external"]
+            return row | {"said": " ".join(done.stderr.split())}
+
+        (tmp_path / "demobench.toml").write_text("[benchmark]\nfolds = 3\n")
+        copied = ("--lerobot-feature", "observation.environment_state=observation.state")
+        row = score("hub:me/small@main", "hub:me/act_small@main", *copied)
+    assert row["policy"] == "act_small"
+    assert f"hub:me/act_small@main: commit {commit}" in row["said"]
+    assert row["episodes"] == sorted(set(range(len(LENGTHS))) - set(TRAINED_ON))
+    assert row["chunk"] == 5
+    shutil.make_archive(str(tmp_path / "small"), "zip", small, "recorded")
+    again = score("small.zip", str(act), "--name", "act_small", *copied)
+    assert again["error_by_horizon"] == row["error_by_horizon"]

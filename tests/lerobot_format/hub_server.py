@@ -1,4 +1,4 @@
-"""A small Hub on 127.0.0.1: the part of its HTTP interface that `huggingface_hub` needs to fetch data sets.
+"""A small Hub on 127.0.0.1: the part of its HTTP interface that `huggingface_hub` needs to fetch data sets and models.
 
 Branches and tags point at commits, large files answer with a redirect and X-Linked headers as on the real Hub, the tree
 comes in pages, refusals carry X-Error-Code. It counts what it was asked.
@@ -142,10 +142,12 @@ class _Handler(BaseHTTPRequestHandler):
         parts = [unquote(part) for part in url.path.strip("/").split("/")]
         if parts[0] == "blobs":
             self._blob(parts[1])
-        elif parts[:2] == ["api", "datasets"]:
+        elif parts[0] == "api" and parts[1] in ("datasets", "models"):
             self._api(parts[2:], parse_qs(url.query))
         elif parts[0] == "datasets" and "resolve" in parts:
             self._file("/".join(parts[1:3]), parts[4], "/".join(parts[5:]))
+        elif parts[2:3] == ["resolve"]:  # a model's address has no word before its name
+            self._file("/".join(parts[:2]), parts[3], "/".join(parts[4:]))
         else:
             self._refuse(404, None)
 

@@ -14,7 +14,7 @@ import pytest
 
 from pipeline.errors import DatasetError, HubError
 from pipeline.lerobot_format import hub as hub_module
-from pipeline.lerobot_format.hub import current_commit, fetch, parse_repository
+from pipeline.lerobot_format.hub import current_commit, fetch, fetch_checkpoint, parse_repository
 from pipeline.lerobot_format.read import load_source, read_dataset, source_stamp
 from tests.makers import tiny_recording, write_v2, write_v3
 
@@ -390,3 +390,53 @@ def test_a_private_data_set_with_the_token_from_its_file(hub: Hub, folder: Path,
     assert ran.stdout.strip().endswith("6")
     assert "Bearer hf_token_in_a_file" in hub.tokens
     assert "hf_token_in_a_file" not in ran.stdout + ran.stderr
+
+
+# Checkpoints -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def checkpoint(tmp_path: Path) -> Path:
+    """The files of a policy as LeRobot pushes it, and some that nobody needs to predict with it."""
+    folder = tmp_path / "policy"
+    for name in ("config.json", "train_config.json", "policy_preprocessor.json", "policy_postprocessor.json"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("{}")
+    for name in ("model.safetensors", "policy_preprocessor_step_3_normalizer_processor.safetensors"):
+        (folder / name).write_bytes(b"weights " * 400)
+    (folder / "README.md").write_text("a policy")
+    (folder / "training_state").mkdir()
+    (folder / "training_state/optimizer_state.safetensors").write_bytes(b"moments " * 400)
+    return folder
+
+
+def test_a_checkpoint_comes_with_what_it_is_asked_with_and_nothing_else(hub: Hub, checkpoint: Path, monkeypatch):
+    commit = hub.push("me/act", checkpoint)
+    copy = fetch_checkpoint("me/act@main")
+    assert copy.commit == commit
+    names = {path.name for path in checkpoint.iterdir() if path.is_file()} - {"README.md"}
+    assert {path.relative_to(copy.folder).as_posix() for path in copy.folder.rglob("*") if path.is_file()} == names
+    assert all((copy.folder / name).read_bytes() == (checkpoint / name).read_bytes() for name in names)
+    unplug(monkeypatch)
+    assert fetch_checkpoint(f"me/act@{commit}") == copy, "a commit that is whole in the cache needs no network"
+    (warning,) = fetch_checkpoint("me/act").warnings
+    assert "out of reach" in warning
+
+
+def test_a_checkpoint_whose_bytes_are_not_those_of_its_hash_is_fetched_again(hub: Hub, checkpoint: Path, no_pause):
+    hub.push("me/act", checkpoint)
+    hub.faults.append(Fault("/blobs/", change=lambda content: b"x" * len(content)))
+    copy = fetch_checkpoint("me/act")
+    assert (copy.folder / "model.safetensors").read_bytes() == (checkpoint / "model.safetensors").read_bytes()
+
+
+def test_no_such_checkpoint_and_a_repository_that_is_none(hub: Hub, folder: Path):
+    with pytest.raises(HubError, match="shows no checkpoint 'me/nothing'"):
+        fetch_checkpoint("me/nothing")
+    with pytest.raises(HubError, match="does not name a checkpoint on the Hub"):
+        fetch_checkpoint("nothing")
+    hub.push("me/tape", folder)
+    with pytest.raises(
+        HubError, match=r"'hub:me/tape' holds no config\.json, so it is no checkpoint that LeRobot saved"
+    ):
+        fetch_checkpoint("me/tape")
