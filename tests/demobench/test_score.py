@@ -236,12 +236,14 @@ def test_the_documented_example_runs(place, scored):
     assert "336 anchors of 12 episodes" in out.stdout
     (code,) = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
     assert sum(bool(line.strip()) for line in code.splitlines()) <= 10, "an example that is read at a glance"
+    code = code.replace("path/to/tape", str(place / "tape"))
     subprocess.run([sys.executable, "-c", code], cwd=folder, check=True, timeout=60)
     out = demobench("score", "tape", folder / "my_act.parquet", "--json", "act.json", cwd=place)
     assert out.returncode == 0, out.stderr
     row = rows_of(place, "act.json")["my_act"]
     assert row["seen_in_training"] is None
     assert row["observations"] == "elsewhere"
+    assert row["error_by_horizon"] == pytest.approx(row["hold_still_by_horizon"]), "it reached the observations"
     assert "nothing is known about the episodes it was trained on" in " ".join(out.stdout.split())
     (table,) = json.loads((place / "act.json").read_text())
     words = [c["words"] for c in table["comparisons"] if c["a"] == "my_act/elsewhere"]
