@@ -76,7 +76,10 @@ def write_anchors(
         pq.write_table(rows, draft)
         draft.replace(path)
     except OSError as error:
-        raise StoreError(f"The anchors cannot be written to {path}: {error.strerror or error}.") from None
+        why = os.strerror(error.errno) if error.errno else str(error)  # arrow's own words name the draft
+        raise StoreError(
+            f"The anchors cannot be written to {path}: {why}. Name a file in a folder that is there."
+        ) from None
     finally:
         draft.unlink(missing_ok=True)
     return len(anchors)

@@ -109,7 +109,7 @@ def _read_rows(path: Path, width: int, columns_words: str) -> dict[str, np.ndarr
                 first += len(batch)
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(
-            f"The predictions {path} cannot be read as parquet: {str(error).splitlines()[0]}. Write them with pandas "
+            f"The predictions {path} cannot be read as parquet: {str(error).splitlines()[0].rstrip('.')}. Write them with pandas "
             "(to_parquet) or pyarrow."
         ) from None
     if not first:

@@ -95,8 +95,13 @@ def unused(tmp_path_factory) -> Path:
         (["ours.parquet", "--trained-on", "none.json"], ["none.json, named by --trained-on, cannot be read"]),
         (["--remove", "our"], ["Nothing was scored under the name 'our'"]),
         (["--lerobot", "tape"], ["--lerobot-python PATH", "go together"]),
+        (["--lerobot", "runs/act", "--lerobot-python", "python"], ["runs/act is no folder", "on the Hub write hub:runs/act."]),
+        (["--lerobot", "hub:act", "--lerobot-python", "python"], ["'hub:act' does not name a checkpoint on the Hub"]),
+        (["--lerobot", "tape", "--lerobot-python", sys.executable], ["has no LeRobot", "python3.12 -m venv"]),
+        (["--lerobot", "tape", "--lerobot-python", "x", "--lerobot-feature", "state"], ["takes CHECKPOINTS_NAME=DATA_SETS_NAME"]),
+        (["--lerobot", "tape", "--lerobot-python", "x", "--lerobot-feature", "a=actoin"], ["Did you mean 'action'"]),
         (["--write-anchors", "a.parquet", "--fold", "4"], ["There is no fold 4", "4 folds, 0 to 3"]),
-        (["--write-anchors", "none/a.parquet"], ["cannot be written to"]),
+        (["--write-anchors", "none/a.parquet"], ["cannot be written to none/a.parquet: No such file or directory. Name a"]),
         (["ours.parquet", "--fold", "1"], ["--fold says which anchors"]),
         (["swapped.parquet"], ["swapped.parquet: action columns are permuted: joint_0 holds joint_1"]),
     ],
@@ -127,7 +132,7 @@ def test_the_documented_example_fills_the_anchors(unused, monkeypatch):
     CliRunner().invoke(app, ["score", "tape", "--write-anchors", "anchors.parquet"])
     (code,) = re.findall(r"```python\n(.*?)```", DOCS.read_text(encoding="utf-8"), re.DOTALL)
     assert sum(bool(line.strip()) for line in code.splitlines()) <= 10, "an example that is read at a glance"
-    exec(code, {})
+    exec(code.replace("path/to/", ""), {})
     answers = read_answers(unused / "my_act.parquet", tiny_demonstrations(12, 30), 3)
     assert len(answers.covered) == 3
     assert answers.actions.shape[3:] == (16, 2)
