@@ -310,3 +310,21 @@ def test_any_recording_survives_the_round_trip(
     assert new.content_hash == old.content_hash
     np.testing.assert_array_equal(new.lengths, lengths)
     np.testing.assert_array_equal(new.columns[ACTION], made.features[ACTION][1])
+
+
+def test_episode_numbers_beyond_32_bits(tmp_path: Path):
+    """Numbers are held in 32 bits until one does not fit."""
+    recording = tiny_recording(3, 10)
+    folder = write_v3(tmp_path / "set", recording)
+
+    def renumbered(table: pa.Table) -> pa.Table:
+        numbers = table["episode_index"].to_numpy().astype(np.int64)
+        numbers = np.where(numbers == 2, 2**33, numbers)
+        return table.set_column(table.schema.get_field_index("episode_index"), "episode_index", pa.array(numbers))
+
+    for path in (*folder.glob("data/*/*.parquet"), *folder.glob("meta/episodes/*/*.parquet")):
+        edit_table(path, renumbered)
+    read = read_dataset(folder, name="set")
+    assert read.episode_ids.tolist() == [0, 1, 2**33]
+    np.testing.assert_array_equal(read.columns[ACTION], recording.features[ACTION][1])
+    assert read.warnings == read_dataset(write_v3(tmp_path / "plain", recording), name="plain").warnings
