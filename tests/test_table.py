@@ -209,26 +209,6 @@ def test_what_a_checkpoint_says_of_its_training_is_never_markup():
     assert ": [bold]odd" in text
 
 
-def test_samples_are_told_of_at_the_first_action_and_one_second_ahead():
-    demos = make_demos()
-    table = make_table(demos, make_semantics(demos))
-    table["dataset"]["warnings"] = []
-    first = {
-        "count": 8,
-        "in_deviations": False,
-        "energy": {"value": 1.5},
-        "of_one": {"value": 3.0},
-        "at_one_second": None,
-    }
-    row = {"method": "external", "training": "known", "warnings": [], "episodes": [1], "seen_in_training": None}
-    table["policies"][0].update(row, samples=first)
-    known = "errors are of the mean of 8 samples; at the first action one sample is 3.00 px off (L2), fair energy score 1.50 px"
-    assert f"{known}\n" in drawn(table, 200)
-    later = {"energy": {"value": 5.0}, "of_one": {"value": 9.0}}
-    table["policies"][0]["samples"] = first | {"at_one_second": later}
-    assert f"{known}; one second ahead one sample is 9.00 px off (L2), fair energy score 5.00 px\n" in drawn(table, 200)
-
-
 def test_parts_that_other_commands_show():
     demos = random_walks((50,) * 2)
     refused = radius_floor(demos, semantics(demos), STATE_ONLY, radius=1e-6)

@@ -19,6 +19,8 @@ from tests.test_table import facts_of
 SAMPLES = {
     "count": 8, "in_deviations": False, "energy": {"value": 1.25, "interval": None},
     "of_mean": {"value": 2.0, "interval": None}, "of_one": {"value": 3.5, "interval": None},
+    "at_one_second": {"energy": {"value": 5.0}, "of_mean": {"value": 6.0}, "of_one": {"value": 9.0}},
+    "by_horizon": {},
 }  # fmt: skip
 
 
@@ -85,7 +87,8 @@ def test_a_reader_is_told_where_a_row_comes_from(table):
     text = drawn(table, marked="held/state")
     for words in (
         "→ held", "seen (seen in training)", "held: held's training", "held: off by a constant: a0 by +3",
-        "held: errors are of the mean of 8 samples; one sample is 3.50 px off (L2), fair energy score 1.25",
+        "held: errors are of the mean of 8 samples; at the first action one sample is 3.50 px off (L2), fair energy score 1.25 px; "
+        "one second ahead one sample is 9.00 px off (L2), fair energy score 5.00 px",
         "held, predicted elsewhere, has a first-step error of 0.00100 px on 2 episodes; it is better than hold-still on those",
         "on 2 episodes that it was trained on, which says nothing about others: no verdict",
     ):  # fmt: skip
