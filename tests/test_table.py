@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from pipeline.sinks.explanations import facts
 from pipeline.sinks.text_table import render_table
 from pipeline.statistics.floors import measure_floors
 from pipeline.statistics.radius import radius_floor
@@ -207,6 +208,19 @@ def test_what_a_checkpoint_says_of_its_training_is_never_markup():
     text = drawn(table, 200)
     assert ": trained on [/] [red]x" in text
     assert ": [bold]odd" in text
+
+
+def test_what_was_left_out_of_every_number_is_said():
+    demos = make_demos()
+    table = make_table(demos, make_semantics(demos))
+    table["dataset"]["warnings"] = []
+    words = "left out by the configuration: episodes 3, 17"
+    assert "left out by" not in drawn(table, 200)
+    table["dataset"]["excluded"] = [3, 17]
+    assert f"{words}\n" in drawn(table, 200)
+    assert words in facts(table)[0]
+    table["dataset"]["excluded"] = list(range(20))
+    assert "episodes 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11 …\n" in drawn(table, 200)
 
 
 def test_parts_that_other_commands_show():

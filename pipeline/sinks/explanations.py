@@ -12,6 +12,7 @@ from pipeline.sinks.findings import (
     NOT_HELD,
     capital,
     elsewhere_words,
+    excluded_words,
     families_words,
     family,
     first_step_gap,
@@ -39,7 +40,7 @@ def facts(table: Table) -> list[list[str]]:
             plural(data["episodes"], "episode"), plural(data["frames"], "frame"), f"{data['fps']:g} fps",
             f"{plural(len(data['action_names']), 'action column')} ({kinds}; {units})",
             f"revision {data['revision'][:12]}" if data["revision"] else "no revision",
-            f"content {data['content_hash'][:12]}",
+            f"content {data['content_hash'][:12]}", *filter(None, [excluded_words(table)]),
         ],
         [
             f"protocol {table['protocol']}", f"budget {budget_words(table)}", plural(len(folds), "fold"),

@@ -16,7 +16,7 @@ Row = Mapping[str, Any]
 MARKS = {"better": "✓", "cannot tell": "?", "worse": "✗", "not comparable": "–"}
 """Beside a verdict's word, so that neither colour nor reading is needed to find it."""
 LOSSES = {"rmse": "RMSE", "mae": "MAE", "l2": "L2"}
-MOST_NAMED = 5
+MOST_NAMED, MOST_LEFT_OUT = 5, 12
 
 
 NOT_HELD = "no policy is held against a floor under protocol notebook: it averages over frames, a floor over episodes"
@@ -43,6 +43,18 @@ def answer(table: Table) -> list[Sentence]:
     found += [_from_elsewhere(table, row) for row in table["policies"] if is_elsewhere(row)]
     driven = [row for row in table["policies"] if row["rollouts"]]
     return [*found, _best_driven(driven)] if driven else found
+
+
+def excluded_words(table: Table) -> str:
+    """The episodes that the configuration leaves out of every number; nothing where it leaves out none."""
+    numbers = table["dataset"].get("excluded") or ()
+    more = " …" if len(numbers) > MOST_LEFT_OUT else ""
+    named = ", ".join(map(str, numbers[:MOST_LEFT_OUT]))
+    return (
+        f"left out by the configuration: {'episodes' if len(numbers) > 1 else 'episode'} {named}{more}"
+        if numbers
+        else ""
+    )
 
 
 # Policies -------------------------------------------------------------------------------------------------------------

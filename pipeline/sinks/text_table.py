@@ -15,6 +15,7 @@ from pipeline.sinks.findings import (
     answer,
     champion,
     elsewhere_words,
+    excluded_words,
     families_words,
     first_step_gap,
     gap_parts,
@@ -261,7 +262,7 @@ def _units_words(dataset: Mapping[str, Any]) -> str:
 
 
 def _footnotes(table: Mapping[str, Any]) -> list[str]:
-    lines = [_setting(table), _means(table)]
+    lines = [*filter(None, [excluded_words(table)]), _setting(table), _means(table)]
     if any(row["verdict"]["vs_hold_still"] for row in table["policies"]):
         lines.append(
             f"against: paired tests over episodes and seeds, {families_words(table)} ✓ better, ✗ worse, ? cannot tell; "

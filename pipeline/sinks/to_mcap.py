@@ -157,6 +157,7 @@ def _describe(
         "content_hash": demos.content_hash,
         "fps": f"{demos.fps:g}",
         "episodes": ", ".join(str(demos.episode_ids[e]) for e in episodes),
+        "excluded": ", ".join(map(str, demos.excluded)),
         "action_names": ", ".join(action.names),
         "action_units": ", ".join(unit or "unknown" for unit in action.units),
         "action_kinds": ", ".join(semantics.kinds),

@@ -160,6 +160,7 @@ def _open_run(
         "split_hash": task.split.hash,
         "revision": task.demos.revision or "",
         "data_set": task.demos.name,
+        "excluded": ", ".join(map(str, task.demos.excluded))[:5000],
         **tags,
     }
     client.log_batch(

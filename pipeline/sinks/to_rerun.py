@@ -146,6 +146,7 @@ def _properties(demos: Demonstrations, semantics: Semantics) -> dict[str, Any]:
         "dataset": demos.name,
         "revision": demos.revision or "",
         "content_hash": demos.content_hash,
+        "excluded": ", ".join(map(str, demos.excluded)),
         "fps": demos.fps,
         "action_names": list(demos.features[ACTION].names),
         "action_units": [unit or "unknown" for unit in demos.features[ACTION].units],

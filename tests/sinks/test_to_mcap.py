@@ -63,6 +63,7 @@ def test_stamps_equal_log_times_and_predictions_sit_at_their_anchor(tmp_path, de
 
 
 def test_metadata_names_data_units_kinds_and_what_the_caller_adds(tmp_path, demos, semantics, predictions):
+    demos = replace(demos, excluded=(40, 41))
     write_mcap(tmp_path / "a.mcap", demos, semantics, predictions, [1], metadata={"protocol": "strict"})
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file)
@@ -73,6 +74,7 @@ def test_metadata_names_data_units_kinds_and_what_the_caller_adds(tmp_path, demo
     assert described["protocol"] == "strict"
     assert described["dataset"] == "small"
     assert described["content_hash"] == demos.content_hash
+    assert described["excluded"] == "40, 41"
     assert described["action_units"] == "px, px"
     assert described["action_kinds"] == "position, position"
     assert described["episodes"] == "8"
