@@ -270,7 +270,7 @@ def score(
     dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
     predictions: Annotated[
         Path | None,
-        typer.Argument(metavar="[PREDICTIONS.parquet]", help="Predictions made anywhere (docs/scoring.md)."),
+        typer.Argument(metavar="PREDICTIONS.parquet", help="Predictions made anywhere (docs/scoring.md)."),
     ] = None,
     write_anchors: Annotated[
         Path | None, typer.Option(metavar="OUT.parquet", help="Write the rows to fill in, and stop.")
