@@ -30,6 +30,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 class Plan:
     """How much a policy may learn, and with what. Numbers depend on all of it but `checkpoint` and `on_step`.
 
+    cpu_seconds         of each seed, instead of steps: a trial finds out how many steps that is
+    recorded            a file that remembers how many it was; where it is there, no trial is made
     checkpoint          a file to go on from and to keep up to date, or None
     checkpoint_every_s  seconds between two of them
     on_step             called with (step, steps, loss) now and then
@@ -40,6 +42,8 @@ class Plan:
     steps: int
     threads: int = 1
     device: str = "cpu"
+    cpu_seconds: float | None = None
+    recorded: Path | None = None
     checkpoint: Path | None = None
     checkpoint_every_s: float = 20.0
     on_step: Callable[[int, int, float], None] | None = None

@@ -1,7 +1,8 @@
-"""Training a stack of networks on windows: batches, steps, checkpoints.
+"""Training networks on windows: batches, steps, budgets, checkpoints; and the batched stack's training.
 
 What belongs here: the loop, which goes on from a checkpoint to the same bytes as without a break. What does not: the
-choice of loss, sizes and rates (each policy's own file), or files of finished policies (`pipeline.train`).
+choice of loss, sizes and rates (each policy's own file), training of torch modules (`networks`), or files of finished
+policies (`pipeline.train`).
 """
 
 import hashlib
@@ -9,10 +10,11 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,9 +27,18 @@ from pipeline.policies.batched import Stack
 from pipeline.types import ACTION
 from pipeline.windows import Windows
 
-LOSSES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"l1": torch.abs, "squared": torch.square}
+
+def _huber(error: torch.Tensor) -> torch.Tensor:
+    """Squared up to one deviation, straight beyond (Huber 1964)."""
+    size = error.abs()
+    return torch.where(size < 1, 0.5 * size * size, size - 0.5)
+
+
+LOSSES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"l1": torch.abs, "squared": torch.square, "huber": _huber}
 LOGGED = 200
 """At most about this many points of a loss curve are kept."""
+FIRST, TRIAL = 5, 0.03
+"""A trial of speed: steps that are not timed (at least as many are), and its share of the CPU-seconds."""
 
 
 @dataclass(frozen=True)
@@ -109,56 +120,72 @@ def fit_stack(windows: Windows, recipe: Recipe, plan: Plan, dtype: torch.dtype =
     PolicyError : the loss is not finite any more, or there is no such device.
     StoreError : a checkpoint cannot be written.
     """
-    device = _device(plan.device)
-    with _threads(plan.threads):
+    device = device_named(plan.device)
+    with threads(plan.threads):
         gather = Gather(windows, dtype, device)
-        sizes = (windows.history * gather.inputs.shape[1], *recipe.hidden, windows.chunk * gather.actions.shape[1])
-        stack = Stack.fresh(sizes, plan.seeds, dtype, device)
-        training = _Training(stack, recipe, _fingerprint(windows, recipe, plan, dtype, device))
-        if plan.checkpoint is not None:
-            training.resume(plan.checkpoint)
-        training.run(gather, Batches(len(windows), recipe.batch, plan.seeds), plan)
-    trained = Stack.restore(stack.arrays())
-    return trained, Curve(np.array(training.steps, np.int64), _by_seed(training.losses, plan.seeds), training.seconds)
+        settled = settle_steps(plan, lambda: _StackTraining(gather, windows, recipe, plan, dtype, device))
+        training = _StackTraining(gather, windows, recipe, settled, dtype, device)
+        curve = training.run(settled)
+    return Stack.restore(training.stack.arrays()), curve
 
 
-class _Training:
-    """The state of one training: parameters, the optimiser's moments, the losses so far, the steps and seconds done."""
+class Training:
+    """The state of one training, and its loop: parameters, the optimiser's moments, losses so far, steps and seconds done.
 
-    def __init__(self, stack: Stack, recipe: Recipe, fingerprint: str):
-        self.stack, self.loss, self.fingerprint = stack, recipe.loss, fingerprint
-        self.optimizer = torch.optim.AdamW(
-            list(stack.tensors.values()), lr=recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
-        )
+    A subclass says what the losses of a step are, and what else an update does. Step n depends on its number and on the
+    state alone, never on what was done before a checkpoint was read.
+
+    tensors  the parameters of all seeds by name       kept  what else changes in place from step to step, by name
+    """
+
+    def __init__(self, tensors: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer, fingerprint: str):
+        self.tensors, self.optimizer, self.fingerprint = tensors, optimizer, fingerprint
+        self.kept: dict[str, torch.Tensor] = {}
         self.done, self.seconds = 0, 0.0
         self.steps: list[int] = []
-        self.losses: list[list[float]] = []
+        self.logged: list[list[float]] = []
 
-    def run(self, gather: Gather, batches: Batches, plan: Plan) -> None:
+    def losses(self) -> torch.Tensor:
+        """[S] each seed's loss at step `done`, with gradients."""
+        raise NotImplementedError
+
+    def update(self) -> None:
+        """Change the parameters, whose gradients are there."""
+        self.optimizer.step()
+
+    def run(self, plan: Plan) -> Curve:
+        """Train to the plan's last step, from its checkpoint if there is one of this training.
+
+        Raises
+        ------
+        PolicyError : the loss is not finite any more.
+        StoreError : a checkpoint cannot be written.
+        """
+        if plan.checkpoint is not None:
+            self._resume(plan.checkpoint)
         every = max(1, math.ceil(plan.steps / LOGGED))
-        device = gather.inputs.device
-        total = torch.zeros(len(plan.seeds), dtype=gather.inputs.dtype, device=device)
+        total: torch.Tensor | float = 0.0
         began, saved, counted = time.perf_counter() - self.seconds, time.perf_counter(), self.done
         while self.done < plan.steps:
-            total += self._step(gather, torch.from_numpy(batches.at(self.done)).to(device))
-            self.done += 1
+            total = total + self.step()
             if self.done % every and self.done < plan.steps:
                 continue
             self._log(total / (self.done - counted), plan)
-            total.zero_()
-            counted, self.seconds = self.done, time.perf_counter() - began
+            total, counted, self.seconds = 0.0, self.done, time.perf_counter() - began
             if plan.checkpoint is not None and time.perf_counter() - saved >= plan.checkpoint_every_s:
-                self.save(plan.checkpoint)
+                self._save(plan.checkpoint)
                 saved = time.perf_counter()
             if plan.on_step is not None:
-                plan.on_step(self.done, plan.steps, float(np.mean(self.losses[-1])))
+                plan.on_step(self.done, plan.steps, float(np.mean(self.logged[-1])))
+        return Curve(np.array(self.steps, np.int64), _by_seed(self.logged, plan.seeds), self.seconds)
 
-    def _step(self, gather: Gather, index: torch.Tensor) -> torch.Tensor:
-        inputs, actions, mask = gather(index)
-        losses = seed_losses(self.stack(inputs) - actions, mask, self.loss)
+    def step(self) -> torch.Tensor:
+        """One step; the losses [S] before it."""
+        losses = self.losses()
         self.optimizer.zero_grad(set_to_none=True)
         losses.sum().backward()
-        self.optimizer.step()
+        self.update()
+        self.done += 1
         return losses.detach()
 
     def _log(self, mean: torch.Tensor, plan: Plan) -> None:
@@ -169,17 +196,18 @@ class _Training:
                 "values that are not finite or far out of range with `demobench inspect`."
             )
         self.steps.append(self.done)
-        self.losses.append(losses)
+        self.logged.append(losses)
 
-    def save(self, path: Path) -> None:
+    def _save(self, path: Path) -> None:
         """Write all of it to one file, which is replaced whole."""
-        tensors = {f"weights.{name}": tensor.detach() for name, tensor in self.stack.tensors.items()}
-        for name, tensor in self.stack.tensors.items():
+        tensors = {f"weights.{name}": tensor.detach() for name, tensor in self.tensors.items()}
+        tensors |= {f"kept.{name}": tensor for name, tensor in self.kept.items()}
+        for name, tensor in self.tensors.items():
             moments = self.optimizer.state[tensor]
             tensors |= {f"{moment}.{name}": moments[moment] for moment in ("exp_avg", "exp_avg_sq")}
         progress = {
             "fingerprint": self.fingerprint, "done": self.done, "seconds": self.seconds, "steps": self.steps,
-            "losses": self.losses,
+            "losses": self.logged,
         }  # fmt: skip
         temporary = path.with_name(f".{path.name}.{os.getpid()}")
         try:
@@ -191,10 +219,10 @@ class _Training:
                 temporary.unlink()
             raise StoreError(f"The checkpoint {path} cannot be written ({error}). Make room, then run again.") from None
 
-    def resume(self, path: Path) -> None:
+    def _resume(self, path: Path) -> None:
         """Go on from a checkpoint, if there is one of this very training; otherwise start anew."""
         try:
-            with safe_open(path, framework="pt", device=str(next(iter(self.stack.tensors.values())).device)) as stored:
+            with safe_open(path, framework="pt", device=str(next(iter(self.tensors.values())).device)) as stored:
                 progress = json.loads((stored.metadata() or {}).get("progress", "{}"))
                 if progress.get("fingerprint") != self.fingerprint:
                     return
@@ -202,10 +230,13 @@ class _Training:
         except (OSError, SafetensorError, json.JSONDecodeError):
             return
         self.done, self.seconds = progress["done"], progress["seconds"]
-        self.steps, self.losses = progress["steps"], progress["losses"]
-        for name, tensor in self.stack.tensors.items():
-            with torch.no_grad():
+        self.steps, self.logged = progress["steps"], progress["losses"]
+        with torch.no_grad():
+            for name, tensor in self.kept.items():
+                tensor.copy_(tensors[f"kept.{name}"])
+            for name, tensor in self.tensors.items():
                 tensor.copy_(tensors[f"weights.{name}"])
+        for name, tensor in self.tensors.items():
             self.optimizer.state[tensor] = {
                 "step": torch.tensor(float(self.done), device=tensor.device if tensor.is_cuda else "cpu"),
                 "exp_avg": tensors[f"exp_avg.{name}"],
@@ -213,15 +244,94 @@ class _Training:
             }
 
 
-def _fingerprint(windows: Windows, recipe: Recipe, plan: Plan, dtype: torch.dtype, device: str) -> str:
+class _StackTraining(Training):
+    """A stack's training: weight decay on all of it, a constant rate."""
+
+    def __init__(
+        self, gather: Gather, windows: Windows, recipe: Recipe, plan: Plan, dtype: torch.dtype, device: str
+    ):  # fmt: skip
+        sizes = (windows.history * gather.inputs.shape[1], *recipe.hidden, windows.chunk * gather.actions.shape[1])
+        self.stack, self.loss, self.gather = Stack.fresh(sizes, plan.seeds, dtype, device), recipe.loss, gather
+        self.batches = Batches(len(windows), recipe.batch, plan.seeds)
+        tensors = self.stack.tensors
+        optimizer = torch.optim.AdamW(
+            list(tensors.values()), lr=recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
+        )
+        super().__init__(tensors, optimizer, fingerprint(windows, asdict(recipe), plan, device, str(dtype)))
+
+    def losses(self) -> torch.Tensor:
+        index = torch.from_numpy(self.batches.at(self.done)).to(self.gather.inputs.device)
+        inputs, actions, mask = self.gather(index)
+        return seed_losses(self.stack(inputs) - actions, mask, self.loss)
+
+
+def fingerprint(windows: Windows, recipe: Mapping[str, Any], plan: Plan, device: str, dtype: str) -> str:
+    """What a checkpoint must agree on to be gone on from."""
     settings = {
-        "windows": windows.hash(), "recipe": asdict(recipe), "seeds": plan.seeds, "steps": plan.steps,
-        "threads": plan.threads, "device": device, "dtype": str(dtype), "torch": torch.__version__,
+        "windows": windows.hash(), "recipe": recipe, "seeds": plan.seeds, "steps": plan.steps,
+        "threads": plan.threads, "device": device, "dtype": dtype, "torch": torch.__version__,
     }  # fmt: skip
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
 
-def _device(asked: str) -> str:
+# Budgets --------------------------------------------------------------------------------------------------------------
+
+
+def settle_steps(plan: Plan, make: Callable[[], Training]) -> Plan:
+    """The plan with its steps known: where it gives CPU-seconds, a trial says how many steps they are.
+
+    Rates, shuffles and noise then depend on steps alone, so that training for the recorded number again gives the same
+    bytes, however fast the machine is. The trial is thrown away, its time counts. Seconds are of all the processor's cores,
+    for each seed; on a GPU they are seconds of the clock.
+    """
+    if plan.cpu_seconds is None:
+        return plan
+    steps = _recorded(plan.recorded)
+    if steps is None:
+        steps = _try_out(make(), plan)
+        if plan.recorded is not None:
+            plan.recorded.parent.mkdir(parents=True, exist_ok=True)
+            draft = plan.recorded.with_name(f".{plan.recorded.name}.{os.getpid()}")
+            draft.write_text(json.dumps({"cpu_seconds": plan.cpu_seconds, "steps": steps}))
+            draft.replace(plan.recorded)
+    return replace(plan, steps=steps, cpu_seconds=None)
+
+
+def _recorded(path: Path | None) -> int | None:
+    try:
+        return int(json.loads(path.read_text())["steps"]) if path is not None else None
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def _try_out(training: Training, plan: Plan) -> int:
+    """Steps that fit into the plan's CPU-seconds: a few at first, which are slow, then at least as many as take TRIAL of them."""
+    on_gpu = next(iter(training.tensors.values())).is_cuda
+
+    def now() -> float:
+        if not on_gpu:
+            return time.process_time()
+        torch.cuda.synchronize()
+        return time.perf_counter()
+
+    began = now()
+    for _ in range(FIRST):
+        training.step()
+    warm, counted = now(), 0
+    while counted < FIRST or now() - warm < TRIAL * plan.cpu_seconds * len(plan.seeds):
+        training.step()
+        counted += 1
+    ended = now()
+    left = plan.cpu_seconds * len(plan.seeds) - (ended - began)
+    return max(1, int(left / ((ended - warm) / counted)))
+
+
+def device_named(asked: str) -> str:
+    """`auto` is a GPU where there is one.
+
+    Raises:
+        PolicyError: "cuda", and there is none.
+    """
     if asked == "cuda" and not torch.cuda.is_available():
         raise PolicyError('device = "cuda", but PyTorch finds no CUDA device here. Use device = "auto" or "cpu".')
     return "cuda" if asked == "auto" and torch.cuda.is_available() else asked.replace("auto", "cpu")
@@ -232,7 +342,7 @@ def _by_seed(losses: list[list[float]], seeds: tuple[int, ...]) -> np.ndarray:
 
 
 @contextmanager
-def _threads(count: int):
+def threads(count: int):
     """Sums depend on how many threads share them, so training runs with a number of its own."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)

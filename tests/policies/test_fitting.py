@@ -57,7 +57,11 @@ def test_the_device_gathers_what_the_windows_say(own_history):
         np.testing.assert_array_equal(mask[seed].numpy().reshape(6, 4, -1)[..., 0] > 0, inside)
 
 
-@pytest.mark.parametrize(("loss", "size"), [("l1", abs), ("squared", lambda x: x * x)])
+def huber(x: float) -> float:
+    return x * x / 2 if abs(x) < 1 else abs(x) - 0.5
+
+
+@pytest.mark.parametrize(("loss", "size"), [("l1", abs), ("squared", lambda x: x * x), ("huber", huber)])
 def test_targets_past_the_end_do_not_count(loss, size):
     error = torch.tensor([[[1.0, -2.0, 5.0]], [[3.0, 4.0, -6.0]]])
     mask = torch.tensor([[[1.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]]])
@@ -105,6 +109,39 @@ def test_all_seeds_together_are_each_seed_alone(windows):
         for name, array in alone.arrays().items():
             np.testing.assert_allclose(array[0], together.arrays()[name][position], rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(alone_curve.losses[0], curve.losses[position], rtol=1e-6)
+
+
+def test_the_loop_is_plain_training(windows):
+    """The same bytes as a dozen plain lines: nothing that is on offer to other networks touches this one."""
+    stack = Stack.fresh((6, 16, 16, 8), (0, 1), torch.float32, "cpu")
+    gather, batches = Gather(windows, torch.float32, "cpu"), Batches(len(windows), 8, (0, 1))
+    optimizer = torch.optim.AdamW(list(stack.tensors.values()), lr=1e-3, weight_decay=1e-4, fused=True)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    for step in range(25):
+        inputs, actions, mask = gather(torch.from_numpy(batches.at(step)))
+        error = (stack(inputs) - actions).abs() * mask
+        optimizer.zero_grad()
+        (error.sum(dim=(1, 2)) / mask.sum(dim=(1, 2))).sum().backward()
+        optimizer.step()
+    torch.set_num_threads(threads)
+    assert bytes_of(fit_stack(windows, SMALL, Plan((0, 1), 25))[0]) == bytes_of(stack)
+
+
+def test_cpu_seconds_become_steps_that_are_recorded(windows, tmp_path):
+    plan = Plan((0, 1), 10**9, cpu_seconds=0.2, recorded=tmp_path / "deeper" / "steps.json")
+    stack, curve = fit_stack(windows, SMALL, plan)
+    steps = json.loads(plan.recorded.read_text())["steps"]
+    assert curve.steps[-1] == steps
+    assert 20 < steps < 20_000
+    assert bytes_of(stack) == bytes_of(fit_stack(windows, SMALL, plan)[0])
+    assert bytes_of(stack) == bytes_of(fit_stack(windows, SMALL, Plan((0, 1), steps))[0])
+    assert json.loads(plan.recorded.read_text())["steps"] == steps
+
+
+def test_more_cpu_seconds_are_more_steps(windows):
+    few, many = (fit_stack(windows, SMALL, Plan((0,), 1, cpu_seconds=s))[1].steps[-1] for s in (0.1, 1.0))
+    assert 3 * few < many
 
 
 def bytes_of(stack: Stack) -> list[bytes]:
