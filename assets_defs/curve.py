@@ -134,6 +134,9 @@ def _draw_curve(bench: Bench, unit: Unit, draft: Path) -> Outcome:
     sets = {s.name: s for s in bench.experiment.observation_sets}
     variant = next(v for v in bench.plan.variants if v.name == policy)
     task = PolicyTask(bench.demonstrations, bench.semantics, bench.split, sets[observations], variant, bench.experiment)
+    if task.steps is None:
+        # CPU-seconds: every size gets as many steps as the full number of episodes got.
+        task = task.with_steps(bench.summary(Unit(f"{policy}/trained_policy", observations))["steps"])
     sizes = curve_sizes(task.split, sizes_of(unit))
     kept = _kept_subsets(bench, policy, observations)
     train_subsets(
@@ -155,7 +158,7 @@ def _draw_curve(bench: Bench, unit: Unit, draft: Path) -> Outcome:
     )
     last = said["sizes"][-1]["error"]
     return Outcome(
-        {**said, "steps": bench.experiment.steps, "seeds": list(task.seeds)},
+        {**said, "steps": task.steps, "seeds": list(task.seeds)},
         {
             "ends_in_the_table": (abs(last - table_value) <= 1e-9 * abs(table_value), f"{last:.6g}"),
             "same_episodes": (bool(same), f"{len(full.episodes)} held-out episodes"),

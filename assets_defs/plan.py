@@ -16,6 +16,7 @@ from typing import Any
 from pipeline.config import hash_of
 from pipeline.experiment import Experiment, Variant
 from pipeline.methods import METHODS, is_own
+from pipeline.settings import SETTINGS, settings_of
 from pipeline.store import Store
 
 CODE_VERSIONS = {
@@ -246,11 +247,11 @@ class Plan:
             case "trained_policy":
                 variant = self._variant_named[unit.asset.split("/")[0]]
                 settings = {"method": variant.method, "chunk": variant.chunk, "windows": CODE_VERSIONS["windows"]}
-                settings |= _dump(e, {"protocol", "history"}) | _of_own_class(variant, e)
+                settings |= _dump(e, {"protocol", "history"}) | _of_method(variant, e) | _given(variant, e)
                 if _depends_on_set(variant):
                     settings["features"] = e.dataset.observations[unit.entry]
                 if variant.is_trained:
-                    settings |= _dump(e, {"seeds", "steps", "threads", "device"})
+                    settings = _dump(e, {"seeds", "steps", "threads", "device"}) | settings
                 return settings
             case "predictions":
                 return {"largest_chunk": e.largest_chunk}
@@ -279,14 +280,33 @@ def _depends_on_set(variant: Variant) -> bool:
     return METHODS[variant.method].uses_observations
 
 
-def _of_own_class(variant: Variant, experiment: Experiment) -> dict[str, Any]:
-    """What a class of the user's own is made with, and the bytes of the file it is in."""
+def _of_method(variant: Variant, experiment: Experiment) -> dict[str, Any]:
+    """What the method is made with, as far as it differs from the defaults; of a class of the user's own also the bytes of
+    the file it is in."""
+    made_with = experiment.policies[variant.family].settings
+    if variant.method in SETTINGS:
+        changed = settings_of(variant.method, made_with).model_dump(mode="json", exclude_defaults=True)
+        return {"settings": changed} if changed else {}
     if not is_own(variant.method):
         return {}
     from pipeline.policies.own import source_hash
 
-    made_with = experiment.policies[variant.family].settings
     return {"method": variant.method.rpartition(":")[2], "source": source_hash(variant.method), "settings": made_with}
+
+
+def _given(variant: Variant, experiment: Experiment) -> dict[str, Any]:
+    """What the policy was given beside, as far as it is used; a budget of its own takes the place of the benchmark's."""
+    given = experiment.policies[variant.family].given
+    if "history" in given:
+        given["own_history"] = given.pop("history")
+    if "cpu_seconds" in given:
+        given["steps"] = None
+    if "features" in given and is_own(given["features"]):
+        from pipeline.policies.own import source_hash
+
+        given |= {"features_source": source_hash(given["features"], "features")}
+        given["features"] = given["features"].rpartition(":")[2]
+    return {"derived" if key == "features" else key: value for key, value in given.items()}
 
 
 def _installed(simulator: str | None) -> dict[str, str | None] | None:

@@ -92,14 +92,18 @@ def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
         bench = workbench.open(context, budget)
         made = _make_entries(bench, variant, "trained_policy", _train)
         rows = [
-            (entry, m.summary["parameters"], m.summary["train_s"], m.summary["last_loss"]) for entry, m in made.items()
+            (
+                entry,
+                *(m.summary.get(name) for name in ("parameters", "steps", "train_s", "cpu_s", "vram_mb", "last_loss")),
+            )
+            for entry, m in made.items()
         ]
         links = {f"mlflow_{entry}": dg.MetadataValue.text(m.summary["mlflow_run_id"]) for entry, m in made.items()}
         plots = {
             f"losses_{unit.entry}": picture(bench.plan.folder(unit) / "losses.png")
             for unit in bench.plan.selected_units(variant, "trained_policy")
         }
-        header = ["observations", "parameters", "training seconds", "last loss"]
+        header = ["observations", "parameters", "steps", "training s", "CPU s", "GPU memory, MB", "last loss"]
         metadata = {"training": table(header, rows), **plots, **links}
         return result(bench, asset_key, made, present(metadata), ["finite_losses"])
 
@@ -121,6 +125,7 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
         draft,
         unfinished,
         lambda done, total, loss: bench.progress(name, done, total, "" if np.isnan(loss) else f"loss {loss:.4g}"),
+        recorded=bench.store.dataset(bench.plan.key) / ".steps" / f"{bench.plan.fingerprint(unit)}.json",
     )
     known = all(t.losses.size for t in folds)
     last = float(np.mean([t.losses[:, -1].mean() for t in folds])) if known else None
@@ -139,6 +144,9 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
         {
             "parameters": folds[0].parameters,
             "train_s": sum(t.train_s for t in folds),
+            "steps": max(t.steps for t in folds),
+            "cpu_s": sum(t.cpu_s for t in folds),
+            "vram_mb": max(t.vram_mb for t in folds),
             "last_loss": last,
             "mlflow_run_id": run_id,
         },

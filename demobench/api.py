@@ -14,7 +14,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config import BUDGETS, DatasetConfig, PolicyConfig, find_config, load_config
+from pipeline.config import BUDGETS, DatasetConfig, find_config, load_config, parse_config
 from pipeline.errors import ConfigError, did_you_mean
 from pipeline.experiment import Choices, Experiment, Variant, resolve_target, variants
 from pipeline.types import (
@@ -147,6 +147,7 @@ def predict(
     name: str | None = None,
     settings: Mapping[str, Any] | None = None,
     on_step: Callable[[int, int, float], None] | None = None,
+    **given: Any,
 ) -> Predictions:
     """Train a method on every fold, and predict what each fold held out.
 
@@ -155,20 +156,17 @@ def predict(
     method : as in the configuration: `mlp`, `hold_still`, …, or a class of your own, `my_policy.py:MyPolicy`.
     chunk : K, for methods that take one.
     name : what the policy is called; its method's name if left out. A chunk size is added to it: `mlp_k16`.
-    settings : of a class of your own.
+    settings : what the method is made with, as under `[policies.<name>]`.
     on_step : called with (step, steps, loss) now and then, for each fold anew.
+    given : further keys of `[policies.<name>]`: history, actions, features, augment, steps, cpu_seconds.
     """
     from pipeline.predict import join_folds, predict_policy
     from pipeline.train import train_policy
 
-    task = _task(data, method, chunk, observations, name, settings)
-    experiment, parts = task.experiment, []
+    task = _task(data, method, chunk, observations, name, {"settings": dict(settings or {}), **given})
+    parts = []
     for number, fold in enumerate(task.split.folds):
-        trained = train_policy(
-            task.variant.method, task.windows(fold.train, fold), seeds=task.seeds,
-            steps=experiment.steps if task.variant.is_trained else 0, threads=experiment.threads,
-            device=experiment.device, on_step=on_step, settings=task.own_settings,
-        )  # fmt: skip
+        trained = train_policy(task.variant.method, task.windows(fold.train, fold), on_step=on_step, **task.training)
         predicted = predict_policy(
             trained.policy, task.windows(fold.test, fold), name=task.variant.name,
             observations=task.observation_set.name, fold=number, seeds=task.seeds, horizons=task.horizons,
@@ -259,7 +257,7 @@ def _task(
     chunk: int | None,
     observations: str | None,
     name: str | None = None,
-    settings: Mapping[str, Any] | None = None,
+    given: Mapping[str, Any] | None = None,
 ) -> "PolicyTask":
     """A policy of the configuration's methods, whether or not the file has it."""
     from pipeline.folds import PolicyTask
@@ -269,7 +267,8 @@ def _task(
         raise ConfigError(f"No method '{method}'. {did_you_mean(method, METHODS)}")
     family = name or method.rpartition(":")[2]
     chunks = (chunk or 1,) if METHODS[method].chunk == "set" else ()
-    policy = PolicyConfig(method=method, chunks=chunks, settings=dict(settings or {}))
+    said = {"method": method, "chunks": chunks, **(given or {})}
+    policy = parse_config({"policies": {family: said}}, "predict()").policies[family]
     (variant,) = variants({family: policy})
     experiment = data.experiment.model_copy(update={"policies": {**data.experiment.policies, family: policy}})
     return PolicyTask(

@@ -15,7 +15,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 
 from pipeline.errors import ConfigError, did_you_mean
-from pipeline.methods import EXTERNAL, METHODS, is_own
+from pipeline.methods import DERIVED, EXTERNAL, METHODS, SYMMETRIES, is_own
+from pipeline.settings import SETTINGS, settings_of
 from pipeline.types import ActionKind, ColumnChoice, Protocol
 
 BUDGETS = {"quick": 600, "standard": 3_000, "thorough": 20_000}
@@ -112,16 +113,46 @@ class DatasetConfig(Settings):
         return ColumnChoice(self.state, action, self.units, files, tuple(sorted(set(self.exclude))))
 
 
+class AugmentConfig(Settings):
+    """How training windows are varied.
+
+    noise     on what is seen: a share of each column's deviation, or by unit or column name
+    symmetry  of the data set, by name; each window of a batch is turned by it or not, by chance
+    """
+
+    noise: Annotated[float, Field(ge=0)] | dict[str, Annotated[float, Field(ge=0)]] = 0.0
+    symmetry: str | None = None
+
+
 class PolicyConfig(Settings):
-    """One entry of [policies]; `settings` are what a class of the user's own is made with."""
+    """One entry of [policies]; `settings` are what its method is made with."""
 
     method: str
     chunks: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = ()
     observations: Literal["all"] | tuple[str, ...] = "all"
     only_when_named: bool = False
+    history: Annotated[int, Field(ge=1, le=1000)] | None = None
+    actions: Literal["absolute", "relative"] = "absolute"
+    features: str | None = None
+    augment: AugmentConfig = AugmentConfig()
+    steps: Annotated[int, Field(ge=1)] | None = None
+    cpu_seconds: Annotated[float, Field(gt=0)] | None = None
     settings: dict[str, Any] = {}
 
-    optional = frozenset({"settings"})
+    optional = frozenset({"history", "actions", "features", "augment", "steps", "cpu_seconds", "settings"})
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """What of the keys that not every method takes is used, by the name under which methods list it."""
+        used = {key: getattr(self, key) for key in ("history", "features", "steps", "cpu_seconds")}
+        used |= {"actions": None if self.actions == "absolute" else self.actions}
+        used |= {"noise": self.augment.noise or None, "symmetry": self.augment.symmetry}
+        return {key: value for key, value in used.items() if value is not None}
+
+    @property
+    def view(self) -> dict[str, Any]:
+        """What of that its transform and augmentation are made from."""
+        return {key: value for key, value in self.given.items() if key in ("actions", "features", "noise", "symmetry")}
 
 
 class ScheduleConfig(Settings):
@@ -234,11 +265,40 @@ def parse_config(raw: dict[str, Any], where: str) -> Config:
                     f"{where}: [policies.{name}] sees the observation set '{named}', which no data set has. "
                     f"{did_you_mean(named, sets)}"
                 )
-        if policy.settings and not is_own(policy.method):
-            raise ConfigError(
-                f"{where}: [policies.{name}] has settings, which only a class of your own takes. Remove them."
-            )
+        try:
+            check_policy(policy)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: [policies.{name}] {error}") from None
     return config
+
+
+def check_policy(policy: PolicyConfig) -> None:
+    """Everything about a policy that can be said without data: its settings, and what its method can be given.
+
+    Raises:
+        ConfigError: an unknown setting, something that the method does not take, two budgets.
+    """
+    takes = METHODS[policy.method].takes
+    for key in policy.given:
+        if key not in takes:
+            place = f"augment.{key}" if key in ("noise", "symmetry") else key
+            raise ConfigError(
+                f"{place} is not for the method '{policy.method}'. It takes {', '.join(sorted(takes)) or 'nothing of the kind'}."
+            )
+    if policy.steps is not None and policy.cpu_seconds is not None:
+        raise ConfigError("has steps and cpu_seconds: two budgets. Keep one.")
+    if policy.features is not None and policy.features not in DERIVED and not is_own(policy.features):
+        raise ConfigError(
+            f"features '{policy.features}' do not exist. {did_you_mean(policy.features, DERIVED)} "
+            'A function of your own is named by its file: features = "my_features.py:function".'
+        )
+    if policy.augment.symmetry is not None and policy.augment.symmetry not in SYMMETRIES:
+        known = did_you_mean(policy.augment.symmetry, SYMMETRIES)
+        raise ConfigError(f"augment.symmetry '{policy.augment.symmetry}' does not exist. {known}")
+    if policy.method in SETTINGS:
+        settings_of(policy.method, policy.settings)
+    elif policy.settings and not is_own(policy.method):
+        raise ConfigError(f"has settings, and the method '{policy.method}' takes none. Remove them.")
 
 
 def _first_problem(error: ValidationError) -> str:
@@ -259,6 +319,8 @@ def _keys_at(path: list[str]) -> list[str]:
         "datasets": DatasetConfig, "policies": PolicyConfig, "schedule": ScheduleConfig,
     }  # fmt: skip
     model = blocks.get(path[0], Config) if path else Config
+    if path[:1] == ["policies"] and path[2:] == ["augment"]:
+        model = AugmentConfig
     return list(model.model_fields)
 
 

@@ -133,7 +133,7 @@ def train_subsets(
     """
     kept.mkdir(parents=True, exist_ok=True)
     subsets = nested_subsets(task.split, sizes)
-    steps = task.experiment.steps if task.variant.is_trained else 1
+    steps = task.steps or 1
     for number, subset in enumerate(subsets):
         report = None if on_step is None else _counting(on_step, subset, number * steps, len(subsets) * steps)
         path = kept / f"{subset.name}.safetensors"
@@ -169,13 +169,9 @@ def predict_subset(
     trained = train_policy(
         task.variant.method,
         task.windows(fold.train, fold),
-        seeds=task.seeds,
-        steps=task.experiment.steps if task.variant.is_trained else 0,
-        threads=task.experiment.threads,
-        device=task.experiment.device,
         checkpoint=checkpoint,
         on_step=on_step,
-        settings=task.own_settings,
+        **task.training,
     )
     return predict_policy(
         trained.policy,

@@ -87,6 +87,13 @@ class Experiment(Settings):
         steps = f"{self.seeds} seed{'s' * (self.seeds != 1)} × {self.steps:,} steps"
         return f"{self.budget} ({steps})" if self.budget else steps
 
+    def budget_of(self, variant: Variant) -> str:
+        """How long one network of a policy trains: by its own budget, where it has one."""
+        policy = self.policies[variant.family]
+        if policy.cpu_seconds is not None:
+            return f"{policy.cpu_seconds:g} CPU-seconds"
+        return f"{policy.steps or self.steps:,} steps"
+
     @property
     def command(self) -> str:
         """The command line that gives these numbers from anywhere; `--folds` only where it is a number."""
@@ -215,10 +222,15 @@ def _absolute_dataset(dataset: DatasetConfig, config_dir: Path) -> DatasetConfig
 
 
 def _absolute_method(policy: PolicyConfig, config_dir: Path) -> PolicyConfig:
-    """The file of a class of the user's own, made absolute likewise."""
-    if not is_own(policy.method) or ".py:" not in policy.method:
-        return policy
-    return policy.model_copy(update={"method": str((config_dir / Path(policy.method).expanduser()).resolve())})
+    """The files of a class and of derived features of the user's own, made absolute likewise."""
+    named = {"method": policy.method, "features": policy.features}
+    files = {key: name for key, name in named.items() if name is not None and is_own(name) and ".py:" in name}
+    update = {key: str((config_dir / Path(name).expanduser()).resolve()) for key, name in files.items()}
+    return policy.model_copy(update=update) if update else policy
+
+
+NO_BUDGET = {"steps": None, "cpu_seconds": None}
+"""A policy that trains as long as the benchmark says."""
 
 
 @dataclass(frozen=True)
@@ -332,6 +344,9 @@ def with_choices(base: Experiment, choices: Choices) -> Experiment:
         named = [name for name, steps in BUDGETS.items() if steps == choices.steps]
         updates |= {"budget": named[0] if named else None, "steps": choices.steps}
     policies = dict(base.policies)
+    if choices.budget is not None or choices.steps is not None:
+        # Who asks for a budget on the command line wants it for every policy.
+        policies = {name: policy.model_copy(update=NO_BUDGET) for name, policy in policies.items()}
     for name in choices.policies:
         if name not in policies and name in METHODS:
             chunks = (choices.chunks or (1, 16)) if METHODS[name].chunk == "set" else ()

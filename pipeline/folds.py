@@ -6,13 +6,14 @@ its errors mean (`statistics`).
 
 import shutil
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.experiment import Experiment, Variant
+from pipeline.config import PolicyConfig
+from pipeline.experiment import NO_BUDGET, Experiment, Variant
 from pipeline.lerobot_format.quality import dead_columns
 from pipeline.methods import METHODS
 from pipeline.split import make_split
@@ -46,9 +47,35 @@ class PolicyTask:
         return tuple(range(self.experiment.seeds)) if self.variant.is_trained else (0,)
 
     @property
-    def own_settings(self) -> dict[str, Any]:
-        """What a class of the user's own is made with."""
-        return self.experiment.policies[self.variant.family].settings
+    def policy(self) -> PolicyConfig:
+        """What the configuration says of it; of predictions made elsewhere it says nothing."""
+        return self.experiment.policies.get(self.variant.family) or PolicyConfig(method=self.variant.method)
+
+    @property
+    def steps(self) -> int | None:
+        """Training steps; None where CPU-seconds decide."""
+        if not self.variant.is_trained:
+            return 0
+        return None if self.policy.cpu_seconds is not None else self.policy.steps or self.experiment.steps
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """What `train_policy` is told beside windows."""
+        return {
+            "seeds": self.seeds,
+            "steps": self.steps,
+            "cpu_seconds": self.policy.cpu_seconds,
+            "threads": self.experiment.threads,
+            "device": self.experiment.device,
+            "settings": self.policy.settings,
+            "given": self.policy.view,
+        }
+
+    def with_steps(self, steps: int) -> "PolicyTask":
+        """The same task with a budget in steps, such as CPU-seconds once came to."""
+        policy = self.policy.model_copy(update=NO_BUDGET | {"steps": steps})
+        policies = {**self.experiment.policies, self.variant.family: policy}
+        return replace(self, experiment=self.experiment.model_copy(update={"policies": policies}))
 
     def windows(self, episodes: Iterable[int], fold: Fold) -> Windows:
         """The anchors of some episodes, normalised by what this fold may learn from."""
@@ -63,7 +90,7 @@ class PolicyTask:
             history=self.experiment.history,
             chunk=self.variant.chunk or 1,
             recipe=method.recipe,
-            own_history=self.observation_set.history if method.uses_observations else None,
+            own_history=self.policy.history or self.observation_set.history if method.uses_observations else None,
         )
 
 
@@ -80,32 +107,32 @@ def split_of(experiment: Experiment, demos: Demonstrations) -> Split:
 
 
 def train_folds(
-    task: PolicyTask, folder: Path, unfinished: Path, on_step: Callable[[int, int, float], None] | None = None
+    task: PolicyTask,
+    folder: Path,
+    unfinished: Path,
+    on_step: Callable[[int, int, float], None] | None = None,
+    recorded: Path | None = None,
 ) -> "list[Trained]":
     """Train on every fold; weights go to `folder/fold_0`, ….
 
     What a killed run leaves in `unfinished` (finished folds and a checkpoint) the next one goes on from.
-    `on_step(done, total, loss)` counts the steps of all folds.
+    `on_step(done, total, loss)` counts the steps of all folds. `recorded` is the file that remembers how many steps a budget in
+    CPU-seconds came to: they are those of the first fold for all, and of any later training of the same result.
     """
     from pipeline.train import load_trained, save_trained, train_policy
 
     folds = task.split.folds
-    steps = task.experiment.steps if task.variant.is_trained else 0
     results = []
     for number, fold in enumerate(folds):
         kept = unfinished / f"fold_{number}"
         if not kept.exists():
-            report = None if on_step is None else _counting_from(on_step, number * steps, len(folds))
             trained = train_policy(
                 task.variant.method,
                 task.windows(fold.train, fold),
-                seeds=task.seeds,
-                steps=steps,
-                threads=task.experiment.threads,
-                device=task.experiment.device,
                 checkpoint=unfinished / "checkpoint.safetensors",
-                on_step=report,
-                settings=task.own_settings,
+                on_step=None if on_step is None else _counting_from(on_step, number, len(folds)),
+                recorded=recorded or unfinished / "steps.json",
+                **task.training,
             )
             draft = kept.with_name(f".{kept.name}")
             save_trained(trained, draft)
@@ -116,9 +143,9 @@ def train_folds(
 
 
 def _counting_from(
-    on_step: Callable[[int, int, float], None], before: int, folds: int
+    on_step: Callable[[int, int, float], None], fold: int, folds: int
 ) -> Callable[[int, int, float], None]:
-    return lambda done, total, loss: on_step(before + done, total * folds, loss)
+    return lambda done, total, loss: on_step(fold * total + done, total * folds, loss)
 
 
 def predict_folds(task: PolicyTask, trained: Path) -> tuple[Predictions, dict[str, Any]]:

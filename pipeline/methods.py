@@ -1,6 +1,8 @@
-"""The methods there are: from a name to where a method lives and what a benchmark must know of it.
+"""The methods there are: from a name to where a method lives and what a benchmark must know of it; likewise the derived
+features and symmetries that policies can be given by name.
 
-What belongs here: what may be asked about a method without importing torch. What does not: the methods (`policies`).
+What belongs here: what may be asked about a method without importing torch. What does not: the methods (`policies`), what each is
+made with (`settings`).
 
 A name is one of this project's (`mlp`), `path/to/file.py:Class` or `package.module:Class` for a class of the user's own, or
 `external` for predictions that were made elsewhere (`pipeline.external`).
@@ -22,6 +24,7 @@ class Method:
     uses_observations  its answer depends on the observation set; else it runs once a data set
     frames             frames of `observation.state` that a method without an observation set looks at
     recipe             which windows it is made for (`windows.Recipe`)
+    takes              what it can be given by the configuration (`TRANSFORM`, `BUDGET`, "history", "noise")
     address            of a class of the user's own, which `cls` then finds
     """
 
@@ -32,6 +35,7 @@ class Method:
     uses_observations: bool = True
     frames: int = 0
     recipe: Literal["arm", "every_frame"] = "arm"
+    takes: frozenset[str] = frozenset()
     address: str | None = None
 
     def load_class(self) -> Any:
@@ -39,6 +43,12 @@ class Method:
         found = getattr(import_module(self.module), self.cls)
         return found if self.address is None else found(self.address)
 
+
+TRANSFORM = frozenset({"history", "actions", "features", "symmetry"})
+"""What concerns only what a policy sees and answers."""
+BUDGET = frozenset({"steps", "cpu_seconds"})
+NETWORK = TRANSFORM | BUDGET | {"noise"}
+HISTORY = frozenset({"history"})
 
 EXTERNAL = "external"
 """The method of predictions made elsewhere: nothing here can train it or ask it."""
@@ -53,7 +63,7 @@ class Methods(dict[str, Method]):
         if name == EXTERNAL:
             return Method("pipeline.external", "", chunk="set", trained=True)
         if is_own(name):
-            return Method("pipeline.policies.own", "OwnMethod", chunk="set", trained=True, address=name)
+            return Method("pipeline.policies.own", "OwnMethod", chunk="set", trained=True, takes=HISTORY, address=name)
         raise KeyError(name)
 
     def __contains__(self, name: object) -> bool:
@@ -72,10 +82,21 @@ METHODS = Methods(
         "constant_velocity": Method(
             "pipeline.policies.constant_velocity", "ConstantVelocity", uses_observations=False, frames=2
         ),
-        "nearest_neighbour": Method("pipeline.policies.nearest_neighbour", "NearestNeighbour"),
-        "mlp": Method("pipeline.policies.mlp", "Mlp", chunk="set", trained=True),
+        "nearest_neighbour": Method("pipeline.policies.nearest_neighbour", "NearestNeighbour", takes=HISTORY),
+        "mlp": Method("pipeline.policies.mlp", "Mlp", chunk="set", trained=True, takes=NETWORK),
+        "gmm": Method("pipeline.policies.gmm", "Gmm", chunk="set", trained=True, takes=NETWORK),
+        "lwr": Method("pipeline.policies.lwr", "Lwr", chunk="set", trained=True, takes=TRANSFORM),
+        "flow": Method("pipeline.policies.flow", "Flow", chunk="set", trained=True, takes=NETWORK),
+        "diffusion": Method("pipeline.policies.diffusion", "Diffusion", chunk="set", trained=True, takes=NETWORK),
+        "act": Method("pipeline.policies.act", "Act", chunk="set", trained=True, takes=NETWORK),
         "notebook_pusht": Method(
             "pipeline.policies.notebook_pusht", "NotebookPushT", chunk="one", trained=True, recipe="every_frame"
         ),
     }
 )
+
+DERIVED = {"pusht_block_frame": ("pipeline.policies.pusht_views", "block_frame")}
+"""Functions that derive features from what is seen: name → module and function (`policies.transform` says what they get)."""
+
+SYMMETRIES = {"pusht_mirror": ("pipeline.policies.pusht_views", "mirror")}
+"""A data set's own symmetries, likewise."""

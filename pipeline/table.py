@@ -5,17 +5,17 @@ not: working any of them out, or drawing it (`sinks.text_table`).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from pipeline.by_task import errors_by_task
-from pipeline.experiment import Experiment
+from pipeline.experiment import Experiment, Variant
 from pipeline.external.pairing import Rival, judge_with_elsewhere
 from pipeline.statistics.brackets import Scored, Sight, form_brackets, gap_to_floor, sight_of, value_of_sensors
 from pipeline.statistics.comparisons import table_comparisons
-from pipeline.types import FloorEstimate, RadiusFloor, Split
+from pipeline.types import FloorEstimate, ObservationSet, RadiusFloor, Split
 
 METRICS = (
     "first_step_mae", "first_step_rmse", "first_step_l2", "at_one_second_mae", "at_one_second_rmse",
@@ -138,7 +138,7 @@ def _against_floors(
         Scored(
             e["variant"].name,
             e["observations"],
-            sight_of(e["variant"], sets[e["observations"]], history, kinds),
+            sight_of(e["variant"], _seen_by(e["variant"], sets[e["observations"]], experiment), history, kinds),
             e["errors"],
         )
         for e in entries
@@ -162,6 +162,13 @@ def _against_floors(
                     {"horizon": floor.horizon, "loss": floor.loss, "floor": floor.value, **asdict(gap)}
                 )
     return {"brackets": brackets, "sensors": value_of_sensors(estimates, sights, brackets)}
+
+
+def _seen_by(variant: Variant, observation_set: ObservationSet, experiment: Experiment) -> ObservationSet:
+    """The observation set as a policy sees it, with as many frames as the policy was given."""
+    policy = experiment.policies.get(variant.family)
+    own = policy.history if policy is not None else None
+    return observation_set if own is None else replace(observation_set, history=own)
 
 
 def floor_json(floors: Sequence[RadiusFloor], measured: Sequence[FloorEstimate] = ()) -> dict[str, Any]:

@@ -31,7 +31,8 @@ class Trained:
 
     policy        answers `predict`, has `seeds`, `chunk`, `parameters` (see `pipeline.policies`)
     steps_logged  [L]     losses [S, L], each the mean since the entry before; both empty for policies that do not train
-    train_s       seconds of training, all seeds together
+    train_s       seconds of training, all seeds together; cpu_s of all processor cores
+    vram_mb       the most memory of a GPU that was in use, 0 without one
     """
 
     method: str
@@ -40,6 +41,13 @@ class Trained:
     losses: np.ndarray
     train_s: float
     parameters: int
+    cpu_s: float = 0.0
+    vram_mb: float = 0.0
+
+    @property
+    def steps(self) -> int:
+        """How many steps each seed was trained for; 0 for policies that do not train, or do not say."""
+        return int(self.steps_logged[-1]) if len(self.steps_logged) else 0
 
 
 def train_policy(
@@ -47,33 +55,43 @@ def train_policy(
     windows: Windows,
     *,
     seeds: Sequence[int],
-    steps: int,
+    steps: int | None,
+    cpu_seconds: float | None = None,
     threads: int = 1,
     device: str = "cpu",
     checkpoint: Path | None = None,
+    recorded: Path | None = None,
     on_step: Callable[[int, int, float], None] | None = None,
     settings: Mapping[str, Any] | None = None,
+    given: Mapping[str, Any] | None = None,
 ) -> Trained:
     """Fit a method on the windows of training episodes, all seeds together.
 
     Parameters
     ----------
+    cpu_seconds : of each seed, in place of `steps`; `recorded` is a file that remembers how many steps they came to.
     checkpoint : a file. Training goes on from it where it belongs to the same windows and settings, and keeps it up to
         date; it stays there afterwards. The weights are the same bytes as without a break.
     on_step : called with (step, steps, mean loss of the seeds) about 200 times.
-    settings : what a class of the user's own is made with.
+    settings : what the method is made with (`pipeline.settings`; of a class of the user's own, what its `__init__` takes).
+    given : what policies of any method can be given (`config.PolicyConfig.view`).
 
     Raises
     ------
     PolicyError : no such method, or the loss is not finite any more.
+    ConfigError : a setting that the method does not have.
     """
     if method not in METHODS:
         raise PolicyError(f"No method '{method}'. {did_you_mean(method, METHODS)}")
-    plan = Plan(tuple(seeds), steps, threads, device, checkpoint, on_step=on_step, settings=settings or {})
+    plan = Plan(
+        tuple(seeds), steps or 0, threads, device, cpu_seconds, recorded, checkpoint,
+        on_step=on_step, settings=settings or {}, given=given or {},
+    )  # fmt: skip
     policy, curve = METHODS[method].load_class().fit(windows, plan)
     if curve is None:
         return Trained(method, policy, np.empty(0, np.int64), np.empty((1, 0), np.float32), 0.0, policy.parameters)
-    return Trained(method, policy, curve.steps, curve.losses, curve.train_s, policy.parameters)
+    costs = (curve.train_s, policy.parameters, curve.cpu_s, curve.vram_mb)
+    return Trained(method, policy, curve.steps, curve.losses, *costs)
 
 
 def save_trained(trained: Trained, folder: Path) -> None:
@@ -90,6 +108,8 @@ def save_trained(trained: Trained, folder: Path) -> None:
         "losses": trained.losses.tolist(),
         "train_s": trained.train_s,
         "parameters": trained.parameters,
+        "cpu_s": trained.cpu_s,
+        "vram_mb": trained.vram_mb,
     }
     (folder / TRAINING).write_text(json.dumps(training))
 
@@ -110,7 +130,8 @@ def load_trained(folder: Path) -> Trained:
         policy = policy_class.restore(load_file(folder / WEIGHTS), described["settings"])
         losses = np.array(training["losses"], np.float32)
         steps = np.array(training["steps"], np.int64)
-        return Trained(described["method"], policy, steps, losses, training["train_s"], training["parameters"])
+        costs = (training["train_s"], training["parameters"], training.get("cpu_s", 0.0), training.get("vram_mb", 0.0))
+        return Trained(described["method"], policy, steps, losses, *costs)
     except (OSError, SafetensorError, ValueError, KeyError) as error:
         raise PolicyError(
             f"The trained policy in {folder} cannot be read ({type(error).__name__}: {error}). Train it again."

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import Config, check_slug, hash_of, load_config, parse_config
+from pipeline.config import AugmentConfig, Config, PolicyConfig, check_slug, hash_of, load_config, parse_config
 from pipeline.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,6 +25,33 @@ def test_shipped_file_is_the_built_in_default():
         ({"tracking": {"mlflow": "postgres"}}, ["[tracking] mlflow", "sqlite"]),
         ({"datasets": {"..": {"source": "x"}}}, ["cannot be a name"]),
         ({"datasets": {"a/b": {"source": "x"}}}, ["cannot be a name"]),
+        (
+            {"policies": {"a": {"method": "mlp", "chunks": [1], "settings": {"blcks": 2}}}},
+            ["[policies.a]", "no setting 'blcks'", "Did you mean 'blocks'?"],
+        ),
+        (
+            {"policies": {"a": {"method": "mlp", "chunks": [1], "augment": {"symetry": "x"}}}},
+            ["unknown key 'symetry' in [policies.a.augment]", "Did you mean 'symmetry'?"],
+        ),
+        (
+            {"policies": {"a": {"method": "mlp", "chunks": [1], "features": "pusht_blockframe"}}},
+            ["features 'pusht_blockframe' do not exist", "Did you mean 'pusht_block_frame'?"],
+        ),
+        (
+            {"policies": {"a": {"method": "mlp", "chunks": [1], "augment": {"symmetry": "mirror"}}}},
+            ["augment.symmetry 'mirror' does not exist", "pusht_mirror"],
+        ),
+        (
+            {"policies": {"a": {"method": "lwr", "chunks": [1], "augment": {"noise": 0.1}}}},
+            ["augment.noise is not for the method 'lwr'", "symmetry"],
+        ),
+        ({"policies": {"a": {"method": "hold_still", "history": 2}}}, ["history is not for the method 'hold_still'"]),
+        ({"policies": {"a": {"method": "flow", "chunks": [1], "steps": 9, "cpu_seconds": 9}}}, ["two budgets"]),
+        ({"policies": {"a": {"method": "notebook_pusht", "settings": {"width": 9}}}}, ["takes none"]),
+        (
+            {"policies": {"a": {"method": "act", "chunks": [1], "settings": {"width": 30, "heads": 4}}}},
+            ["[policies.a] width is 30"],
+        ),
         ({"benchmark": {"seeds": 0}}, ["benchmark.seeds", "greater than or equal to 1"]),
         ({"benchmark": {"protocol": "loose"}}, ["benchmark.protocol", "'strict' or 'notebook'"]),
         (
@@ -38,6 +65,16 @@ def test_mistakes_are_named(raw, words):
         parse_config(raw, "demobench.toml")
     for word in ["demobench.toml", *words]:
         assert word in str(caught.value)
+
+
+def test_what_a_policy_was_not_given_is_not_in_its_hash():
+    """Keys that came later must not make results stale that do not use them."""
+    policy = Config().policies["mlp"]
+    assert set(policy.model_dump()) == {"method", "chunks", "observations", "only_when_named"}
+    asked = PolicyConfig(method="flow", chunks=(16,), history=2, augment=AugmentConfig(symmetry="pusht_mirror"))
+    assert PolicyConfig.model_validate(asked.model_dump(mode="json")) == asked
+    assert asked.given == {"history": 2, "symmetry": "pusht_mirror"}
+    assert asked.view == {"symmetry": "pusht_mirror"}
 
 
 def test_no_such_file_and_not_toml(tmp_path):

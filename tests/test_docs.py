@@ -1,6 +1,7 @@
 """README and docs cannot rot quietly: commands exist, options exist, every key is described, links lead somewhere."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ import typer.main
 
 from demobench.cli import app
 from pipeline import config
+from pipeline.settings import SETTINGS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted(ROOT.glob("pipeline/embedded/*/README.md"))]
@@ -69,6 +71,22 @@ def test_every_key_of_the_configuration_is_described():
         assert section, f"no section for [{name}]"
         for key in model.model_fields:
             assert f"| `{key}` |" in section[1], f"docs/configuration.md does not describe {key} of [{name}]"
+
+
+def test_every_method_and_its_settings_are_described():
+    text = (ROOT / "docs" / "policies.md").read_text(encoding="utf-8")
+    for method, kind in SETTINGS.items():
+        assert f"| `{method}` |" in text, f"docs/policies.md does not describe the method {method}"
+        rows = [line for line in text.splitlines() if line.startswith("| `")]
+        for setting in kind.model_fields:
+            assert any(f"`{setting}`" in line.split("|")[1] for line in rows), f"{setting} of {method} is not described"
+
+
+def test_the_example_of_policies_is_a_configuration():
+    text = (ROOT / "docs" / "policies.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    recipe = config.parse_config(tomllib.loads(block), "docs/policies.md").policies["recipe"]
+    assert set(recipe.given) == {"history", "actions", "features", "symmetry", "cpu_seconds"}
 
 
 def test_the_readme_names_its_two_commands():

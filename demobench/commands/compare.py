@@ -46,7 +46,7 @@ class Entry:
     fingerprint, mlflow_run_id   either of them, or its beginning, is what `@run` pins
     rollouts                     closed-loop results, or None
     unit                         of the errors, where all action columns share one
-    steps                        of training; None where nobody here trained it
+    steps, budget                of training, a number and in words; None where nobody here trained it
     seen                         whether it was trained on the episodes it is scored on; None: nothing is known
     """
 
@@ -62,6 +62,7 @@ class Entry:
     split_hash: str
     protocol: "Protocol"
     steps: int | None
+    budget: str | None
     fingerprint: str
     mlflow_run_id: str
     seen: bool | None = False
@@ -231,7 +232,8 @@ def _load(plan: "Plan", variant: Variant, observations: str) -> Entry:
         data_hash=facts["content_hash"],
         split_hash=made(Unit("episode_split")).summary["hash"],
         protocol=plan.experiment.protocol,
-        steps=None if elsewhere else plan.experiment.steps,
+        steps=None if elsewhere else trained.get("steps") or plan.experiment.steps,
+        budget=None if elsewhere else plan.experiment.budget_of(variant),
         fingerprint=plan.fingerprint(predictions),
         mlflow_run_id=(trained or made(predictions).summary)["mlflow_run_id"],
         seen=made(predictions).summary["seen_in_training"] if elsewhere else False,
@@ -289,8 +291,8 @@ def _data_differs(a: Entry, b: Entry) -> str | None:
 def _recipe_differs(a: Entry, b: Entry) -> str | None:
     if a.protocol != b.protocol:
         return f"protocol differs: {a.protocol} and {b.protocol}"
-    if a.trained and b.trained and a.steps != b.steps and not (a.is_elsewhere or b.is_elsewhere):
-        return f"budget differs: {a.steps:,} and {b.steps:,} steps"
+    if a.trained and b.trained and a.budget != b.budget and not (a.is_elsewhere or b.is_elsewhere):
+        return f"budget differs: {a.budget} and {b.budget}"
     return None
 
 

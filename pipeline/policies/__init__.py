@@ -35,7 +35,8 @@ class Plan:
     checkpoint          a file to go on from and to keep up to date, or None
     checkpoint_every_s  seconds between two of them
     on_step             called with (step, steps, loss) now and then
-    settings            of a class of the user's own: what its `__init__` takes
+    settings            what the method is made with; of a class of the user's own, what its `__init__` takes
+    given               what policies of any method can be given, as far as it is used: actions, features, noise, symmetry
     """
 
     seeds: tuple[int, ...]
@@ -48,15 +49,20 @@ class Plan:
     checkpoint_every_s: float = 20.0
     on_step: Callable[[int, int, float], None] | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    given: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Training losses, and the seconds that all seeds took together.
+    """Training losses, and what all seeds took together.
 
     steps [L]      losses [S, L], each the mean since the entry before
+    train_s        seconds of the clock            cpu_s  of all processor cores
+    vram_mb        the most memory of a GPU that was in use, 0 without one
     """
 
     steps: np.ndarray
     losses: np.ndarray
     train_s: float
+    cpu_s: float = 0.0
+    vram_mb: float = 0.0

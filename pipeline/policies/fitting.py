@@ -141,7 +141,7 @@ class Training:
     def __init__(self, tensors: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer, fingerprint: str):
         self.tensors, self.optimizer, self.fingerprint = tensors, optimizer, fingerprint
         self.kept: dict[str, torch.Tensor] = {}
-        self.done, self.seconds = 0, 0.0
+        self.done, self.seconds, self.cpu_seconds = 0, 0.0, 0.0
         self.steps: list[int] = []
         self.logged: list[list[float]] = []
 
@@ -166,18 +166,30 @@ class Training:
         every = max(1, math.ceil(plan.steps / LOGGED))
         total: torch.Tensor | float = 0.0
         began, saved, counted = time.perf_counter() - self.seconds, time.perf_counter(), self.done
+        cpu_began = time.process_time() - self.cpu_seconds
+        if self.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(self.device)
         while self.done < plan.steps:
             total = total + self.step()
             if self.done % every and self.done < plan.steps:
                 continue
             self._log(total / (self.done - counted), plan)
-            total, counted, self.seconds = 0.0, self.done, time.perf_counter() - began
+            total, counted = 0.0, self.done
+            self.seconds, self.cpu_seconds = time.perf_counter() - began, time.process_time() - cpu_began
             if plan.checkpoint is not None and time.perf_counter() - saved >= plan.checkpoint_every_s:
                 self._save(plan.checkpoint)
                 saved = time.perf_counter()
             if plan.on_step is not None:
                 plan.on_step(self.done, plan.steps, float(np.mean(self.logged[-1])))
-        return Curve(np.array(self.steps, np.int64), _by_seed(self.logged, plan.seeds), self.seconds)
+        losses = np.array(self.logged, np.float32).reshape(-1, len(plan.seeds)).T
+        return Curve(np.array(self.steps, np.int64), losses, self.seconds, self.cpu_seconds, self._vram_mb())
+
+    def _vram_mb(self) -> float:
+        return torch.cuda.max_memory_allocated(self.device) / 2**20 if self.device.type == "cuda" else 0.0
+
+    @property
+    def device(self) -> torch.device:
+        return next(iter(self.tensors.values())).device
 
     def step(self) -> torch.Tensor:
         """One step; the losses [S] before it."""
@@ -206,8 +218,8 @@ class Training:
             moments = self.optimizer.state[tensor]
             tensors |= {f"{moment}.{name}": moments[moment] for moment in ("exp_avg", "exp_avg_sq")}
         progress = {
-            "fingerprint": self.fingerprint, "done": self.done, "seconds": self.seconds, "steps": self.steps,
-            "losses": self.logged,
+            "fingerprint": self.fingerprint, "done": self.done, "seconds": self.seconds, "cpu_seconds": self.cpu_seconds,
+            "steps": self.steps, "losses": self.logged,
         }  # fmt: skip
         temporary = path.with_name(f".{path.name}.{os.getpid()}")
         try:
@@ -222,14 +234,14 @@ class Training:
     def _resume(self, path: Path) -> None:
         """Go on from a checkpoint, if there is one of this very training; otherwise start anew."""
         try:
-            with safe_open(path, framework="pt", device=str(next(iter(self.tensors.values())).device)) as stored:
+            with safe_open(path, framework="pt", device=str(self.device)) as stored:
                 progress = json.loads((stored.metadata() or {}).get("progress", "{}"))
                 if progress.get("fingerprint") != self.fingerprint:
                     return
                 tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
         except (OSError, SafetensorError, json.JSONDecodeError):
             return
-        self.done, self.seconds = progress["done"], progress["seconds"]
+        self.done, self.seconds, self.cpu_seconds = (progress[name] for name in ("done", "seconds", "cpu_seconds"))
         self.steps, self.logged = progress["steps"], progress["losses"]
         with torch.no_grad():
             for name, tensor in self.kept.items():
@@ -306,7 +318,7 @@ def _recorded(path: Path | None) -> int | None:
 
 def _try_out(training: Training, plan: Plan) -> int:
     """Steps that fit into the plan's CPU-seconds: a few at first, which are slow, then at least as many as take TRIAL of them."""
-    on_gpu = next(iter(training.tensors.values())).is_cuda
+    on_gpu = training.device.type == "cuda"
 
     def now() -> float:
         if not on_gpu:
@@ -335,10 +347,6 @@ def device_named(asked: str) -> str:
     if asked == "cuda" and not torch.cuda.is_available():
         raise PolicyError('device = "cuda", but PyTorch finds no CUDA device here. Use device = "auto" or "cpu".')
     return "cuda" if asked == "auto" and torch.cuda.is_available() else asked.replace("auto", "cpu")
-
-
-def _by_seed(losses: list[list[float]], seeds: tuple[int, ...]) -> np.ndarray:
-    return np.array(losses, np.float32).reshape(-1, len(seeds)).T
 
 
 @contextmanager

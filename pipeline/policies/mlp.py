@@ -1,7 +1,10 @@
-"""A multi-layer perceptron that answers a whole chunk of actions at once.
+"""Multi-layer perceptrons that answer a whole chunk of actions at once: behaviour cloning as regression (Pomerleau 1989).
 
-What belongs here: its sizes and rates, and what goes in and comes out. What does not: the batched networks (`batched`)
-and their training (`fitting`).
+What belongs here: their sizes and rates, and what goes in and comes out. What does not: the batched networks (`batched`)
+and their training (`fitting`), training of single networks (`networks`).
+
+Left alone, or with other sizes and rates, it is the plain network, all seeds trained as one stack. Residual blocks, schedules
+and a view of its own (relative actions, derived features, augmentation) are trained one network a seed.
 """
 
 from collections.abc import Mapping
@@ -14,15 +17,18 @@ from pipeline.errors import PolicyError
 from pipeline.normalize import Normalizer
 from pipeline.policies import Curve, Plan
 from pipeline.policies.batched import Stack
-from pipeline.policies.fitting import Recipe, fit_stack
+from pipeline.policies.body import perceptron
+from pipeline.policies.fitting import LOSSES, Recipe, fit_stack
+from pipeline.policies.networks import Net, NetworkPolicy, Shape, masked_mean
+from pipeline.settings import MlpSettings, settings_of
 from pipeline.types import Observations
 from pipeline.windows import Windows
 
 
-class Mlp:
-    """Two hidden layers of 512 with ReLU, L1 loss over the targets inside the episode, AdamW."""
+class PlainMlp:
+    """Hidden layers with ReLU; the recipe is the subclass's."""
 
-    RECIPE: ClassVar[Recipe] = Recipe(hidden=(512, 512), loss="l1", batch=256, learning_rate=1e-3, weight_decay=1e-4)
+    RECIPE: ClassVar[Recipe]
 
     def __init__(self, stack: Stack, normalizer: Normalizer, seeds: tuple[int, ...], history: int, chunk: int):
         self.stack, self.normalizer = stack, normalizer
@@ -34,13 +40,17 @@ class Mlp:
         return self.stack.parameters_of_one
 
     @classmethod
-    def fit(cls, windows: Windows, plan: Plan) -> tuple[Self, Curve]:
+    def fit(cls, windows: Windows, plan: Plan) -> tuple[Any, Curve]:
         """Train one network a seed.
 
         Raises:
             PolicyError: the loss is not finite any more.
         """
-        stack, curve = fit_stack(windows, cls.RECIPE, plan)
+        return cls._fit(windows, plan, cls.RECIPE)
+
+    @classmethod
+    def _fit(cls, windows: Windows, plan: Plan, recipe: Recipe) -> tuple[Self, Curve]:
+        stack, curve = fit_stack(windows, recipe, plan)
         return cls(stack, windows.normalizer, plan.seeds, windows.history, windows.chunk), curve
 
     def predict(self, observations: Observations, horizons: int = 1) -> np.ndarray:
@@ -66,6 +76,53 @@ class Mlp:
         return {"seeds": list(self.seeds), "history": self.history, "chunk": self.chunk}
 
     @classmethod
-    def restore(cls, arrays: Mapping[str, np.ndarray], settings: Mapping[str, Any]) -> Self:
+    def restore(cls, arrays: Mapping[str, np.ndarray], settings: Mapping[str, Any]) -> Any:
         stack, normalizer = Stack.restore(arrays), Normalizer.from_arrays(arrays)
         return cls(stack, normalizer, tuple(settings["seeds"]), settings["history"], settings["chunk"])
+
+
+class Mlp(PlainMlp):
+    """Two hidden layers of 512 with ReLU, L1 loss over the targets inside the episode, AdamW; or what its settings say."""
+
+    RECIPE: ClassVar[Recipe] = Recipe(hidden=(512, 512), loss="l1", batch=256, learning_rate=1e-3, weight_decay=1e-4)
+
+    @classmethod
+    def fit(cls, windows: Windows, plan: Plan) -> tuple[Any, Curve]:
+        """As for every policy; what is asked for decides which kind of network it is.
+
+        Raises:
+            PolicyError: the loss is not finite any more, or what was asked for does not fit the data.
+            ConfigError: a setting that there is not.
+        """
+        asked = settings_of("mlp", plan.settings)
+        if plan.given or not asked.is_plain:
+            return MlpNetwork.fit(windows, plan)
+        hidden = (asked.width, asked.width)
+        return cls._fit(windows, plan, Recipe(hidden, asked.loss, asked.batch, asked.learning_rate, asked.weight_decay))
+
+    @classmethod
+    def restore(cls, arrays: Mapping[str, np.ndarray], settings: Mapping[str, Any]) -> Any:
+        return MlpNetwork.restore(arrays, settings) if "made_with" in settings else super().restore(arrays, settings)
+
+
+class _Regression(Net):
+    def __init__(self, settings: MlpSettings, shape: Shape):
+        super().__init__()
+        self.size = LOSSES[settings.loss]
+        self.body = perceptron(shape.inputs, shape.outputs, settings.width, settings.blocks, settings.dropout)
+
+    def loss(self, inputs: torch.Tensor, targets: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        return masked_mean(self.size(self.body(inputs).float() - targets), mask)
+
+    def answer(self, inputs: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
+        return self.body(inputs)
+
+
+class MlpNetwork(NetworkPolicy):
+    """Regression by a residual (or plain) perceptron with everything that networks can be given."""
+
+    method = "mlp"
+
+    @classmethod
+    def build(cls, settings: MlpSettings, shape: Shape) -> Net:
+        return _Regression(settings, shape)

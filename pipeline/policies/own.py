@@ -204,8 +204,8 @@ def _give_back(one: Any, arrays: Mapping[str, np.ndarray], plain: Mapping[str, A
 # Finding the class ----------------------------------------------------------------------------------------------------
 
 
-def source_file(address: str) -> Path:
-    """The file that the class at `address` is written in.
+def source_file(address: str, key: str = "method") -> Path:
+    """The file that the class at `address` is written in; `key` is where the configuration names it.
 
     Raises:
         PolicyError: no such file or module.
@@ -214,7 +214,7 @@ def source_file(address: str) -> Path:
     if where.endswith(".py"):
         if not Path(where).is_file():
             raise PolicyError(
-                f'method = "{address}": there is no file {where}. Paths are relative to the configuration\'s folder.'
+                f'{key} = "{address}": there is no file {where}. Paths are relative to the configuration\'s folder.'
             )
         return Path(where)
     try:
@@ -223,15 +223,15 @@ def source_file(address: str) -> Path:
         found = None
     if found is None or not found.origin or not found.origin.endswith(".py"):
         raise PolicyError(
-            f"method = \"{address}\": no module '{where}' can be imported here. Install its package into this environment, "
-            'or name a file: method = "my_policy.py:MyPolicy".'
+            f"{key} = \"{address}\": no module '{where}' can be imported here. Install its package into this environment, "
+            f'or name a file: {key} = "my_file.py:{address.rpartition(":")[2]}".'
         )
     return Path(found.origin)
 
 
-def source_hash(address: str) -> str:
+def source_hash(address: str, key: str = "method") -> str:
     """sha256 of the bytes of that file: what makes results of the class stale. What it imports is not looked at."""
-    return hashlib.sha256(source_file(address).read_bytes()).hexdigest()
+    return hashlib.sha256(source_file(address, key).read_bytes()).hexdigest()
 
 
 def load_own_class(address: str) -> type:

@@ -75,7 +75,11 @@ def log_training(
         run_id = _open_run(client, uri, experiment, task, tags)
         experiment_id = client.get_run(run_id).info.experiment_id
         name = f"{task.variant.name}/{task.observation_set.name}"
-        costs = {"train_s": sum(t.train_s for t in trained), "parameters": trained[0].parameters}
+        costs = {
+            "train_s": sum(t.train_s for t in trained),
+            "parameters": trained[0].parameters,
+            "steps": trained[0].steps,
+        }
         _send(client, run_id, _series(costs))
         if task.variant.is_trained:
             for seed_number, seed in enumerate(task.seeds):
@@ -150,9 +154,11 @@ def _open_run(
         "features": ", ".join(task.observation_set.features),
         "protocol": task.experiment.protocol,
         "seeds": len(task.seeds),
-        "steps": task.experiment.steps if variant.is_trained else 0,
+        "steps": task.steps,
         "folds": len(task.split.folds),
-        "history": task.experiment.history,
+        "history": task.policy.history or task.experiment.history,
+        **{key: value for key, value in task.policy.given.items() if key not in ("steps", "history")},
+        **{f"settings.{key}": value for key, value in task.policy.settings.items()},
         **(changes or {}),
     }
     about = {

@@ -59,6 +59,15 @@ def test_numbers_are_those_of_the_command_line(data, place):
     assert found["split"]["hash"] == demobench.split(data).hash
 
 
+def test_a_policy_is_given_what_the_configuration_gives(data):
+    plain = demobench.predict(data, "mlp", chunk=2, settings={"width": 8})
+    relative = demobench.predict(data, "mlp", chunk=2, settings={"width": 8}, actions="relative", steps=9, history=1)
+    assert plain.actions.shape == relative.actions.shape
+    assert not np.array_equal(plain.actions, relative.actions)
+    with pytest.raises(ConfigError, match="unknown key 'action' in .*Did you mean 'actions'"):
+        demobench.predict(data, "mlp", chunk=2, action="relative")
+
+
 def test_compare_says_the_words(data):
     still, mean = demobench.predict(data, "hold_still"), demobench.predict(data, "mean_action")
     (found,) = demobench.compare(data, still, mean)

@@ -162,7 +162,7 @@ def test_one_of_them_against_a_whole_table(place):
         ("tape+newer", "data hash differs: dddddddddddd and eeeeeeeeeeee"),
         ("tape+other", "split differs: ssssssssssss and tttttttttttt"),
         ("tape+notebook", "protocol differs: strict and notebook"),
-        ("tape+quick", "budget differs: 3,000 and 600 steps"),
+        ("tape+quick", "budget differs: 3,000 steps and 600 steps"),
     ],
 )
 def test_the_first_thing_that_differs_is_said(place, capsys, other, why):

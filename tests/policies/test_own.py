@@ -155,7 +155,9 @@ def test_in_the_configuration(tmp_path):
     experiment = from_config(parse_config(toml, "file"), "d", tmp_path)
     assert experiment.policies["mine"].method == f"{tmp_path}/m.py:Mine"
     assert [v.name for v in experiment.variants if v.family == "mine"] == ["mine_k01", "mine_k16"]
-    with pytest.raises(ConfigError, match="has settings, which only a class of your own takes"):
-        parse_config({"policies": {"mlp": {"method": "mlp", "chunks": [1], "settings": {"a": 1}}}}, "file")
+    with pytest.raises(
+        ConfigError, match=r"\[policies.own\] features is not for the method 'm.py:Mine'. It takes history"
+    ):
+        parse_config({"policies": {"own": {"method": "m.py:Mine", "chunks": [1], "features": "a.py:b"}}}, "file")
     with pytest.raises(ConfigError, match="A class of your own is named by its file or module"):
         parse_config({"policies": {"mlp": {"method": "external", "chunks": [1]}}}, "file")
