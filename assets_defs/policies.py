@@ -206,6 +206,7 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
 
     from pipeline.folds import predict_folds
     from pipeline.predict import save_predictions
+    from pipeline.sampling import sampled_scores
     from pipeline.sinks import to_mlflow
     from pipeline.sinks.pictures import picture_horizons
     from pipeline.statistics.metrics import save_errors, score_task
@@ -216,25 +217,31 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
     predicted, facts = predict_folds(task, bench.plan.folder(trained_unit))
     finite = bool(np.isfinite(predicted.actions).all())
     score = score_task(task, predicted)
+    samples = sampled_scores(task, bench.plan.folder(trained_unit))
     save_predictions(predicted, draft)
     save_errors(score.errors, draft / "errors.safetensors")
     picture_horizons(score.metrics, variant.name, _everyone(bench), task.demos, draft / "error_by_horizon.png")
     to_mlflow.log_scores(
         tracking(bench),
         mlflow_run(bench, task, trained_unit),
-        score.metrics,
+        score.metrics | _series_of(samples),
         score.seed_metrics,
         artifacts=[draft / "error_by_horizon.png"],
     )
     held_out = {e for fold in task.split.folds for e in fold.test}
     scored = set(score.errors.episodes.tolist())
     return Outcome(
-        {"metrics": score.metrics, "split_hash": task.split.hash, **facts},
+        {"metrics": score.metrics, "samples": samples, "split_hash": task.split.hash, **facts},
         {
             "finite": (finite, f"{predicted.actions.size:,} numbers"),
             "every_held_out_episode": (scored == held_out, f"{len(scored)} of {len(held_out)} episodes"),
         },
     )
+
+
+def _series_of(samples: dict | None) -> dict[str, list[float]]:
+    """The scores of samples as metrics whose step is the horizon: `samples_energy`, `samples_of_mean`, `samples_of_one`."""
+    return {f"samples_{name}": values for name, values in samples["by_horizon"].items()} if samples else {}
 
 
 def _rollouts(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDefinition:

@@ -19,8 +19,8 @@ from pipeline.external.training import HeldOut, Training, held_out_of
 from pipeline.folds import PolicyTask
 from pipeline.methods import EXTERNAL
 from pipeline.normalize import circular_columns
+from pipeline.sampling import deviations, summarise_samples
 from pipeline.statistics.distributions import score_samples
-from pipeline.statistics.intervals import estimate_mean
 from pipeline.statistics.metrics import Score, score_task
 from pipeline.types import ACTION, Demonstrations, Fold, Predictions, Semantics, Split
 
@@ -116,49 +116,20 @@ def _task(
     return PolicyTask(demos, semantics, Split(tuple(folds), split.seed, split.hash), seen, variant, experiment)
 
 
-SAMPLE_SCORES = ("energy", "of_mean", "of_one")
-"""What `score_samples` gives."""
-
-
 def _score_samples(
     answers: Answers, keep: np.ndarray, held_out: HeldOut, demos: Demonstrations, circular: np.ndarray
 ) -> dict[str, Any]:
-    """The fair energy score of the samples at every step of the chunk, beside what their mean and one of them are worth; with
-    intervals at the first action, and one second ahead where the chunk reaches so far.
-
-    Distances are Euclidean over action columns; where their units differ, in deviations of the recorded column.
-    """
-    anchors, (_, count, _, steps, _) = answers.anchors[keep], answers.actions.shape
-    recorded = demos.columns[ACTION][anchors]
-    mixed = len(set(demos.features[ACTION].units)) > 1
-    scale = np.where(recorded.std(axis=0) > 0, recorded.std(axis=0), np.nan) if mixed else None
+    """The scores of the samples at every step of the chunk, as those of policies trained here (`pipeline.sampling`)."""
+    anchors, actions = answers.anchors[keep], answers.actions[:, :, keep]
+    seeds, count, _, steps, _ = actions.shape
     episode = demos.episode_of_frame[anchors]
-    ends, row = demos.episode_starts[episode + 1], np.searchsorted(held_out.episodes, episode)
-    one_second = round(demos.fps)
-    found: dict[str, Any] = {"count": int(count), "in_deviations": mixed, "at_one_second": None}
-    by_horizon: dict[str, list[float]] = {name: [] for name in SAMPLE_SCORES}
-    for horizon in range(steps):
-        inside = np.flatnonzero(anchors + horizon < ends)
-        if not len(inside):
-            break
-        samples = answers.actions[:, :, np.flatnonzero(keep)[inside], horizon]
-        scores = score_samples(
-            samples, demos.columns[ACTION][anchors[inside] + horizon], circular=circular, scale=scale
-        )
-        means = {name: _mean_over_episodes(getattr(scores, name), row[inside], held_out) for name in SAMPLE_SCORES}
-        for name, mean in means.items():
-            by_horizon[name].append(mean["value"])
-        if horizon == 0:
-            found |= means
-        elif horizon == one_second:
-            found["at_one_second"] = means
-    return found | {"by_horizon": by_horizon}
-
-
-def _mean_over_episodes(values: np.ndarray, row: np.ndarray, held_out: HeldOut) -> dict[str, Any]:
-    """The mean of [S, m] values over the episodes that have some, each counting once, with its interval."""
-    counts = np.bincount(row, minlength=len(held_out.episodes))
-    there = counts > 0
-    of_episode = np.stack([np.bincount(row, one, minlength=len(counts))[there] / counts[there] for one in values])
-    mean = estimate_mean(of_episode, fold=held_out.fold[there])
-    return {"value": mean.value, "interval": None if mean.interval is None else list(mean.interval)}
+    found = {name: np.full((steps, seeds, len(anchors)), np.nan) for name in ("energy", "of_mean", "of_one")}
+    for step in range(steps):
+        inside = np.flatnonzero(anchors + step < demos.episode_starts[episode + 1])
+        if len(inside):
+            recorded = demos.columns[ACTION][anchors[inside] + step]
+            scores = score_samples(actions[:, :, inside, step], recorded, circular=circular, scale=deviations(demos))
+            for name, values in found.items():
+                values[step][:, inside] = getattr(scores, name)
+    fold = held_out.fold[np.searchsorted(held_out.episodes, episode)]
+    return summarise_samples(found, episode, fold, one_second=round(demos.fps), count=count, demos=demos)

@@ -16,7 +16,11 @@ NET = {
 }  # fmt: skip
 RAW = {
     "benchmark": {"seeds": 2, "folds": 2, "steps": 6, "threads": 1},
-    "policies": {"net": NET, "mlp": {"method": "mlp", "chunks": [4]}},
+    "policies": {
+        "net": NET,
+        "mlp": {"method": "mlp", "chunks": [4]},
+        "flow": {"method": "flow", "chunks": [4], "settings": {"blocks": 1, "width": 16, "euler_steps": 2}},
+    },
 }
 TRAINED = Unit("net_k04/trained_policy", "state")
 
@@ -62,7 +66,7 @@ def test_a_default_that_is_written_out_changes_nothing(made):
 
 def test_a_budget_of_its_own_does_not_depend_on_the_benchmark_s(made):
     more = with_net() | {"benchmark": RAW["benchmark"] | {"steps": 7}}
-    assert stale(made, more) == {"mlp_k04/trained_policy"}
+    assert stale(made, more) == {"mlp_k04/trained_policy", "flow_k04/trained_policy"}
 
 
 def test_a_budget_on_the_command_line_is_for_every_policy(made):
@@ -79,3 +83,12 @@ def test_every_fold_and_every_later_training_has_the_recorded_steps(made):
     shutil.rmtree(folder)
     made.run()
     assert [weights_hash(folder / f"fold_{n}") for n in (0, 1)] == before
+
+
+def test_what_draws_is_scored_by_its_samples(made):
+    table = json.loads((made.plan().folder(Unit("benchmark_table")) / "table.json").read_text())
+    rows = {row["policy"]: row for row in table["policies"]}
+    assert rows["net_k04"]["samples"] is None
+    samples = rows["flow_k04"]["samples"]
+    assert 0 < samples["energy"]["value"] < samples["of_one"]["value"]
+    assert len(samples["by_horizon"]["energy"]) == 4
