@@ -25,6 +25,7 @@ class Method:
     frames             frames of `observation.state` that a method without an observation set looks at
     recipe             which windows it is made for (`windows.Recipe`)
     takes              what it can be given by the configuration (`TRANSFORM`, `BUDGET`, "history", "noise")
+    camera             it looks at a camera, beside the observation set
     address            of a class of the user's own, which `cls` then finds
     """
 
@@ -36,6 +37,7 @@ class Method:
     frames: int = 0
     recipe: Literal["arm", "every_frame"] = "arm"
     takes: frozenset[str] = frozenset()
+    camera: bool = False
     address: str | None = None
 
     def load_class(self) -> Any:
@@ -89,6 +91,9 @@ METHODS = Methods(
         "flow": Method("pipeline.policies.flow", "Flow", chunk="set", trained=True, takes=NETWORK),
         "diffusion": Method("pipeline.policies.diffusion", "Diffusion", chunk="set", trained=True, takes=NETWORK),
         "act": Method("pipeline.policies.act", "Act", chunk="set", trained=True, takes=NETWORK),
+        "image": Method(
+            "pipeline.policies.image", "Image", chunk="set", trained=True, takes=NETWORK - {"symmetry"}, camera=True
+        ),
         "notebook_pusht": Method(
             "pipeline.policies.notebook_pusht", "NotebookPushT", chunk="one", trained=True, recipe="every_frame"
         ),

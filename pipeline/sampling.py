@@ -26,7 +26,8 @@ def sampled_scores(task: PolicyTask, trained: Path) -> dict[str, Any] | None:
     """Scores of the samples of a trained policy over every fold (JSON-able); None where the policy does not sample.
 
     `energy`, `of_mean` and `of_one` are of the first action, with intervals over episodes and seeds; under `at_one_second` one
-    second ahead, under `by_horizon` of each action of the chunk. Distances are Euclidean over action columns; where their units differ, in deviations.
+    second ahead, under `by_horizon` of each action of the chunk. Distances are Euclidean over action columns; where their units
+    differ, in deviations.
     """
     from pipeline.train import load_trained
 

@@ -117,6 +117,17 @@ class ActSettings(TrainingSettings):
         return self
 
 
+class ImageSettings(ResidualSettings):
+    """`camera` is the data set's only one if it is not named; pictures are shrunk to squares of `pixels`."""
+
+    camera: str | None = None
+    pixels: Annotated[int, Field(ge=16, le=256)] = 48
+    loss: Literal["l1", "squared", "huber"] = "l1"
+    width: Count = 256
+    blocks: Annotated[int, Field(ge=0, le=100)] = 2
+    batch: Count = 64
+
+
 class LwrSettings(MethodSettings):
     """How many `neighbours` reach how far, and how strongly slopes are held back (`ridge`); 0: chosen on training episodes."""
 
@@ -131,6 +142,7 @@ SETTINGS: dict[str, type[MethodSettings]] = {
     "flow": FlowSettings,
     "diffusion": DiffusionSettings,
     "act": ActSettings,
+    "image": ImageSettings,
 }
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.by_task import errors_by_task
 from pipeline.experiment import Experiment, Variant
 from pipeline.external.pairing import Rival, judge_with_elsewhere
+from pipeline.methods import METHODS
 from pipeline.statistics.brackets import Scored, Sight, form_brackets, gap_to_floor, sight_of, value_of_sensors
 from pipeline.statistics.comparisons import table_comparisons
 from pipeline.types import FloorEstimate, ObservationSet, RadiusFloor, Split
@@ -165,10 +166,12 @@ def _against_floors(
 
 
 def _seen_by(variant: Variant, observation_set: ObservationSet, experiment: Experiment) -> ObservationSet:
-    """The observation set as a policy sees it, with as many frames as the policy was given."""
+    """The observation set as a policy sees it: with as many frames as the policy was given, and with its camera."""
     policy = experiment.policies.get(variant.family)
-    own = policy.history if policy is not None else None
-    return observation_set if own is None else replace(observation_set, history=own)
+    seen = observation_set
+    if policy is not None and policy.history is not None:
+        seen = replace(seen, history=policy.history)
+    return replace(seen, features=(*seen.features, "camera")) if METHODS[variant.method].camera else seen
 
 
 def floor_json(floors: Sequence[RadiusFloor], measured: Sequence[FloorEstimate] = ()) -> dict[str, Any]:

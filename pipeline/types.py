@@ -11,7 +11,7 @@ horizon h = 0 is the action recorded at the anchor's own frame. Frames are numbe
 "global"); episodes by position (0 … E−1), not by the recorded `episode_index`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -182,12 +182,15 @@ class Observations:
     state            [B, T, P] `observation.state`, for baselines that move the arm's own state; P may be 0
     previous_action  [B, A] the action recorded one frame before; NaN at the first frame of an episode
     anchors          [B] global frame numbers, or None in a roll-out
+    look             (camera or None for the only one, pixels) → [B, T, pixels, pixels, 3] uint8, decoded when it is asked;
+                     None where nothing can be looked at, as in a roll-out
     """
 
     values: np.ndarray
     state: np.ndarray
     previous_action: np.ndarray
     anchors: np.ndarray | None = None
+    look: Callable[[str | None, int], np.ndarray] | None = None
 
     def __len__(self) -> int:
         return len(self.values)

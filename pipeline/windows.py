@@ -6,7 +6,7 @@ learning anything. Frames are never copied for a whole data set: memory is O(fra
 
 import hashlib
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError, DatasetError
 from pipeline.lerobot_format.columns import check_observation_set
+from pipeline.lerobot_format.pictures import pictures_of
 from pipeline.normalize import Normalizer, commanded_columns, fit_normalizer
 from pipeline.types import ACTION, STATE, Demonstrations, Observations, ObservationSet, Protocol, Semantics
 
@@ -100,7 +101,11 @@ class Windows:
         previous[anchors == self.first_frame[index]] = np.nan
         states = self.demos.columns.get(STATE)
         state = np.empty((*frames.shape, 0), np.float32) if states is None else rows(states, frames)
-        return Observations(rows(self.values, frames), state, previous, anchors)
+        return Observations(rows(self.values, frames), state, previous, anchors, self.look(frames))
+
+    def look(self, frames: np.ndarray) -> Callable[[str | None, int], np.ndarray]:
+        """How the pictures of frames [B, T] are come by: nothing is opened before it is called."""
+        return lambda camera, pixels: pictures_of(self.demos, camera, pixels)(frames)
 
     def targets(self, index: np.ndarray | slice | None = None) -> tuple[np.ndarray, np.ndarray]:
         """The recorded actions [B, K, A], and a mask [B, K]: False past the end, where an action means nothing."""

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.inspection.finding import Finding
-from pipeline.lerobot_format.files import fill, inside, read_json, read_json_lines, read_table
+from pipeline.lerobot_format.files import inside
+from pipeline.lerobot_format.pictures import listed_videos
 from pipeline.types import Demonstrations
 
-PARTS = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 SLACK = 1
 """Frames that a file may have more or less: encoders drop or repeat the last one."""
 
@@ -66,39 +66,13 @@ def check_videos(demos: Demonstrations, folder: Path | None) -> Iterator[Finding
 
 def _listed(folder: Path, key: str) -> dict[str, _File]:
     """The video files of a camera that meta/ names; empty for pictures kept in the data files."""
-    info = read_json(folder, "meta/info.json")
-    template = info.get("video_path")
-    if not isinstance(template, str) or info.get("features", {}).get(key, {}).get("dtype") != "video":
-        return {}
     files: dict[str, _File] = defaultdict(_File)
-    for row in _rows(folder, key):
-        number, length = row.get("episode_index"), row.get("length")
-        if not isinstance(number, int) or not isinstance(length, int) or length == 0:
-            continue
-        if row.get("file_index") is None:
-            size = info.get("chunks_size")
-            chunk = number // (size if isinstance(size, int) and size > 0 else 1000)
-            place = {"episode_chunk": chunk, "episode_index": number}
-        else:
-            place = {name: row[name] for name in PARTS[:2]}
-        file = files[fill(template, {"video_key": key, **place})]
-        file.episodes.append(number)
-        file.frames += length
-        end = row.get("to_timestamp")
-        file.end_s = max(file.end_s, end if isinstance(end, int | float) else 0.0)
+    for video in listed_videos(folder, key):
+        file = files[video.file]
+        file.episodes.append(video.episode)
+        file.frames += video.length
+        file.end_s = max(file.end_s, video.to_s)
     return files
-
-
-def _rows(folder: Path, key: str) -> list[dict[str, Any]]:
-    """One row an episode: its number and length and, in v3.0, where its video is."""
-    if (folder / "meta/episodes.jsonl").exists():
-        return read_json_lines(folder, "meta/episodes.jsonl")
-    wanted = {"episode_index": "episode_index", "length": "length"} | {f"videos/{key}/{part}": part for part in PARTS}
-    rows = []
-    for path in sorted((folder / "meta/episodes").glob("chunk-*/file-*.parquet")):
-        table = read_table(folder, path.relative_to(folder).as_posix(), wanted.__contains__)
-        rows += table.rename_columns([wanted[name] for name in table.column_names]).to_pylist()
-    return rows
 
 
 def _look(demos: Demonstrations, folder: Path, camera: Any, name: str, file: _File) -> Iterator[Finding]:

@@ -6,6 +6,7 @@
     write.py    arrays → a v3.0 folder                       stats.py    the statistics LeRobot keeps beside the data
     hub.py      download at a pinned commit                  quality.py  kinds, circular columns, warnings, the summary
     files.py    files of an untrusted folder                 units.py    column names and units
+    pictures.py frames of its videos, when they are asked for
 
 A data set is untrusted input: its paths stay inside its folder, sizes are checked before memory is taken, and nothing
 is unpickled. Nothing here splits, scales or trains.

@@ -24,11 +24,11 @@ from pipeline.settings import settings_of
 from pipeline.types import ACTION, Observations
 from pipeline.windows import Windows, rows
 
-NEIGHBOURS = (8, 16, 32, 64, 128, 256)
+NEIGHBOURS = (8, 16, 32, 64, 128, 256, 512, 1024)
 RIDGES = (0.01, 0.1, 1.0, 10.0)
 """What is chosen among; a large ridge is an average without slopes."""
 PROBES = 256
-"""Training windows that the choice is made on."""
+"""Training windows that the choice is made on, at the first, the middle and the last action of the chunk."""
 QUERIES = 64
 """Questions answered at a time."""
 
@@ -80,45 +80,52 @@ class Lwr:
         """[S, B, K, A] float32, raw units."""
         values = observations.values
         inputs, now = self.transform.encode(values), self.transform.now(values)
-        parts = [
-            self.answer(inputs[start : start + QUERIES], self.neighbours, (self.ridge,))[0]
-            for start in range(0, len(inputs), QUERIES)
-        ]
+        parts = []
+        for start in range(0, len(inputs), QUERIES):
+            some = inputs[start : start + QUERIES]
+            parts.append(
+                self.answer(some, self.nearest(some, self.neighbours), (self.ridge,), np.arange(self.chunk))[0]
+            )
         answer = self.transform.decode_actions(np.concatenate(parts), now)
         return np.repeat(answer[None], len(self.seeds), axis=0)
 
-    def answer(
-        self, queries: np.ndarray, neighbours: int, ridges: tuple[float, ...], usable: np.ndarray | None = None
-    ) -> np.ndarray:
-        """[ridges, B, K, A'] encoded. `usable` [B, M] says which windows a question may be answered from."""
-        squared = ((queries**2).sum(1)[:, None] + (self.inputs**2).sum(1)) - 2 * queries @ self.inputs.T
+    def nearest(self, queries: np.ndarray, count: int, usable: np.ndarray | None = None) -> np.ndarray:
+        """[B, k] the windows nearest to each question, nearest first; `usable` [B, M] says which there are for it."""
+        squared = (self.inputs**2).sum(1) - 2 * queries @ self.inputs.T
         if usable is not None:
             squared = np.where(usable, squared, np.inf)
-        neighbours = min(neighbours, int(np.isfinite(squared).sum(axis=1).min()))
-        near = np.argpartition(squared, neighbours - 1, axis=1)[:, :neighbours]
+        count = min(count, int(np.isfinite(squared).sum(axis=1).min()))
+        near = np.argpartition(squared, count - 1, axis=1)[:, :count]
+        order = np.take_along_axis(squared, near, axis=1).argsort(axis=1, kind="stable")
+        return np.take_along_axis(near, order, axis=1)
+
+    def answer(
+        self, queries: np.ndarray, near: np.ndarray, ridges: tuple[float, ...], horizons: np.ndarray
+    ) -> np.ndarray:
+        """[ridges, B, horizons, A'] encoded, from the neighbours [B, k]."""
         apart = self.inputs[near].astype(np.float64) - queries[:, None]
         distance = np.sqrt((apart**2).sum(axis=2))
         # The farthest of them would have no weight at all, and where all are equally far, none would.
         reach = distance.max(axis=1, keepdims=True) * 1.001 + 1e-9
         weight = (1 - (distance / reach) ** 3) ** 3
-        targets, inside = self._targets(near)
-        found = np.stack([_regress(weight, apart, targets, ridge) for ridge in ridges])
-        for horizon in range(1, targets.shape[2]):
+        targets, inside = self._targets(near, horizons)
+        found = _regress(weight, apart, targets, ridges)
+        for position in range(len(horizons)):
             # Windows that end before this horizon have nothing to say about it.
-            some = (inside[..., horizon] < inside[..., 0]).any(axis=1) & inside[..., horizon].any(axis=1)
+            some = ~inside[..., position].all(axis=1) & inside[..., position].any(axis=1)
             if some.any():
-                own = weight[some] * inside[some, :, horizon]
-                one = targets[some][:, :, horizon : horizon + 1]
-                for number, ridge in enumerate(ridges):
-                    found[number, some, horizon] = _regress(own, apart[some], one, ridge)[:, 0]
+                own = weight[some] * inside[some, :, position]
+                one = slice(position, position + 1)
+                found[:, some, one] = _regress(own, apart[some], targets[some][:, :, one], ridges)
         return np.clip(found, targets.min(axis=1), targets.max(axis=1)).astype(np.float32)
 
-    def _targets(self, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[B, k, K, A'] what neighbours did, encoded, and [B, k, K] whether they did."""
+    def _targets(self, near: np.ndarray, horizons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[B, k, horizons, A'] what neighbours did, encoded, and [B, k, horizons] whether they did."""
         ahead, flat = np.arange(self.chunk), near.ravel()
         frames = self.anchors[flat, None] + np.minimum(ahead, self.remaining[flat, None])
         encoded = self.transform.encode_actions(rows(self.actions, frames), self.now[flat])
-        return encoded.reshape(*near.shape, *encoded.shape[1:]), self.remaining[near][..., None] >= ahead
+        chosen = encoded.reshape(*near.shape, *encoded.shape[1:])[:, :, horizons]
+        return chosen, self.remaining[near][..., None] >= horizons
 
     def one_seed(self, position: int = 0) -> Self:
         """The policy of one seed alone."""
@@ -145,20 +152,20 @@ class Lwr:
         )
 
 
-def _regress(weight: np.ndarray, apart: np.ndarray, targets: np.ndarray, ridge: float) -> np.ndarray:
-    """[B, k], [B, k, F] inputs less the question, [B, k, K, A'] → [B, K, A'] the weighted fit's value at the question."""
+def _regress(weight: np.ndarray, apart: np.ndarray, targets: np.ndarray, ridges: tuple[float, ...]) -> np.ndarray:
+    """[B, k], [B, k, F] inputs less the question, [B, k, H, A'] → [ridges, B, H, A'] the weighted fits at the question."""
     batch, count, *chunk = targets.shape
     share = weight / weight.sum(axis=1, keepdims=True)
-    mean = np.einsum("bk,bkf->bf", share, apart)
+    mean = (share[:, None] @ apart)[:, 0]
     flat = targets.reshape(batch, count, -1).astype(np.float64)
-    middle = np.einsum("bk,bkm->bm", share, flat)
+    middle = share[:, None] @ flat
     off = apart - mean[:, None]
     weighted = (share[..., None] * off).transpose(0, 2, 1)
-    covariance = weighted @ off
-    held = ridge * np.trace(covariance, axis1=1, axis2=2) / off.shape[2] + 1e-12
-    covariance[:, np.arange(off.shape[2]), np.arange(off.shape[2])] += held[:, None]
-    slopes = np.linalg.solve(covariance, weighted @ (flat - middle[:, None]))
-    return (middle - np.einsum("bf,bfm->bm", mean, slopes)).reshape(batch, *chunk)
+    covariance, together = weighted @ off, weighted @ (flat - middle)
+    size = off.shape[2]
+    held = np.trace(covariance, axis1=1, axis2=2)[:, None, None] / size * np.eye(size)
+    slopes = [np.linalg.solve(covariance + ridge * held + 1e-12 * np.eye(size), together) for ridge in ridges]
+    return np.stack([(middle - mean[:, None] @ slope).reshape(batch, *chunk) for slope in slopes])
 
 
 def _remember(cls: type[Lwr], windows: Windows, transform: Transform, plan: Plan) -> tuple[Lwr, np.ndarray]:
@@ -195,13 +202,14 @@ def _chosen(policy: Lwr, episode: np.ndarray, unturned: int) -> Lwr:
         return replace(policy, neighbours=neighbours[0], ridge=ridges[0])
     probes = np.random.default_rng(0).permutation(unturned)[:PROBES]
     errors = dict.fromkeys(product(neighbours, ridges), 0.0)
+    horizons = np.unique([0, (policy.chunk - 1) // 2, policy.chunk - 1])
     for start in range(0, len(probes), QUERIES):
         some = probes[start : start + QUERIES]
-        targets, inside = policy._targets(some[:, None])
-        targets, inside = targets[:, 0], inside[:, 0, :, None]
-        usable = episode[some][:, None] != episode
+        targets, inside = policy._targets(some[:, None], horizons)
+        near = policy.nearest(policy.inputs[some], max(neighbours), episode[some][:, None] != episode)
         for count in neighbours:
-            for ridge, answer in zip(ridges, policy.answer(policy.inputs[some], count, ridges, usable), strict=True):
-                errors[count, ridge] += float((np.abs(answer - targets) * inside).sum())
+            answers = policy.answer(policy.inputs[some], near[:, :count], ridges, horizons)
+            for ridge, answer in zip(ridges, answers, strict=True):
+                errors[count, ridge] += float((np.abs(answer - targets[:, 0]) * inside[:, 0, :, None]).sum())
     count, ridge = min(errors, key=lambda pair: errors[pair])
     return replace(policy, neighbours=count, ridge=ridge)

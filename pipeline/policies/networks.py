@@ -9,8 +9,9 @@ that depend on (seed, step) alone, so that a network does not depend on which ot
 
 import hashlib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -22,7 +23,7 @@ from pipeline.policies.fitting import Batches, Training, device_named, fingerpri
 from pipeline.policies.transform import Augment, Transform, fit_augment, fit_transform
 from pipeline.settings import SETTINGS, MethodSettings, TrainingSettings, settings_of
 from pipeline.types import Observations
-from pipeline.windows import Windows, rows
+from pipeline.windows import Windows
 
 SAMPLES_AT_ONCE = 4096
 """At most so many (observation, sample) pairs go through a network together."""
@@ -30,9 +31,11 @@ SAMPLES_AT_ONCE = 4096
 
 @dataclass(frozen=True)
 class Shape:
-    """What goes into a network and comes out: F inputs, K × A' outputs; `limit` [K · A'] is the largest training target."""
+    """What goes into a network and comes out: F inputs from T frames, K × A' outputs; `limit` [K · A'] is the largest training
+    target."""
 
     inputs: int
+    history: int
     chunk: int
     width: int
     limit: np.ndarray
@@ -97,6 +100,11 @@ class NetworkPolicy:
         """A fresh network, its weights from torch's own generator."""
         raise NotImplementedError
 
+    @classmethod
+    def see(cls, settings: Any, transform: Transform, observations: Observations) -> np.ndarray:
+        """[B, F] float32, what enters the network."""
+        return transform.encode(observations.values)
+
     @property
     def chunk(self) -> int:
         return self.shape.chunk
@@ -123,8 +131,8 @@ class NetworkPolicy:
         settings = settings_of(cls.method, plan.settings)
         transform = fit_transform(windows, **_of(plan.given, "actions", "features"))
         augment = fit_augment(windows, **_of(plan.given, "noise", "symmetry"))
-        sampler = Sampler(windows, transform, augment)
-        shape = Shape(sampler.inputs, windows.chunk, transform.width, sampler.limit())
+        sampler = Sampler(windows, transform, augment, partial(cls.see, settings, transform))
+        shape = Shape(sampler.inputs, windows.history, windows.chunk, transform.width, sampler.limit())
 
         def make(settled: Plan) -> NetworkTraining:
             return NetworkTraining(cls, settings, shape, sampler, settled)
@@ -148,7 +156,8 @@ class NetworkPolicy:
     def _ask(self, observations: Observations, count: int, how: str) -> np.ndarray:
         """[S, n, B, K, A]."""
         values = observations.values
-        inputs, now = torch.from_numpy(self.transform.encode(values)), self.transform.now(values)
+        inputs = torch.from_numpy(self.see(self.made_with, self.transform, observations))
+        now = self.transform.now(values)
         batch, block = len(values), max(1, SAMPLES_AT_ONCE // count)
         encoded = np.empty((len(self.seeds), count, batch, self.shape.chunk, self.shape.width), np.float32)
         for number, (seed, net) in enumerate(zip(self.seeds, self.nets, strict=True)):
@@ -196,7 +205,7 @@ class NetworkPolicy:
     def restore(cls, arrays: Mapping[str, np.ndarray], settings: Mapping[str, Any]) -> Self:
         """The inverse of `arrays` and `settings`."""
         transform = Transform.restore(arrays, settings["transform"])
-        shape = Shape(settings["inputs"], transform.chunk, transform.width, arrays["shape.limit"])
+        shape = Shape(settings["inputs"], transform.history, transform.chunk, transform.width, arrays["shape.limit"])
         made_with, seeds = SETTINGS[cls.method].model_validate(settings["made_with"]), tuple(settings["seeds"])
         nets = []
         for seed in seeds:
@@ -222,31 +231,36 @@ class Samples:
 class Sampler:
     """Training windows as a network sees them, varied anew in each step, gathered when they are needed."""
 
-    def __init__(self, windows: Windows, transform: Transform, augment: Augment | None):
-        self.windows, self.transform, self.augment = windows, transform, augment
-        self.inputs = self.transform.encode(self._seen(np.arange(1))).shape[1]
+    def __init__(
+        self,
+        windows: Windows,
+        transform: Transform,
+        augment: Augment | None,
+        see: Callable[[Observations], np.ndarray],
+    ):
+        self.windows, self.transform, self.augment, self.see = windows, transform, augment, see
+        self.inputs = see(windows.observations(slice(0, 1))).shape[1]
 
     def batch(self, index: np.ndarray, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """[B] window numbers → inputs [B, F], targets and mask [B, K · A'], float32."""
-        values, (actions, inside) = self._seen(index), self.windows.targets(index)
+        seen, (actions, inside) = self.windows.observations(index), self.windows.targets(index)
         if self.augment is not None:
-            values, actions = self.augment(values, actions, generator)
+            values, actions = self.augment(seen.values, actions, generator)
+            seen = replace(seen, values=values)
+        values = seen.values
         targets = self.transform.encode_actions(actions, self.transform.now(values))
         mask = np.broadcast_to(inside[..., None], targets.shape).astype(np.float32)
-        return self.transform.encode(values), targets.reshape(len(index), -1), mask.reshape(len(index), -1)
+        return self.see(seen), targets.reshape(len(index), -1), mask.reshape(len(index), -1)
 
     def limit(self) -> np.ndarray:
         """[K · A'] the largest size of each target."""
         largest = np.zeros(self.transform.chunk * self.transform.width, np.float32)
         for start in range(0, len(self.windows), 4096):
             index = np.arange(start, min(start + 4096, len(self.windows)))
-            values, (actions, inside) = self._seen(index), self.windows.targets(index)
+            values, (actions, inside) = self.windows.observations(index).values, self.windows.targets(index)
             targets = np.abs(self.transform.encode_actions(actions, self.transform.now(values))) * inside[..., None]
             largest = np.maximum(largest, targets.reshape(len(index), -1).max(axis=0))
         return np.where(largest > 0, largest, 1.0)
-
-    def _seen(self, index: np.ndarray) -> np.ndarray:
-        return rows(self.windows.values, self.windows.history_frames(index))
 
 
 class NetworkTraining(Training):
