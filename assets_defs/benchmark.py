@@ -81,7 +81,7 @@ def _write_table(bench: Bench, draft) -> Outcome:
                 "errors": load_errors(plan.folder(unit) / "errors.safetensors"),
                 **bench.summary(unit),
                 "parameters": trained["parameters"],
-                "train_s": trained["train_s"],
+                **{name: trained.get(name) for name in ("train_s", "steps", "cpu_s", "vram_mb")},
                 "rollouts": bench.summary(rolled).get("rollouts") if plan.is_fresh(rolled) else None,
             }
         )

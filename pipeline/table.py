@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.by_task import errors_by_task
 from pipeline.experiment import Experiment, Variant
 from pipeline.external.pairing import Rival, judge_with_elsewhere
-from pipeline.methods import METHODS
+from pipeline.methods import BUDGET, METHODS
 from pipeline.statistics.brackets import Scored, Sight, form_brackets, gap_to_floor, sight_of, value_of_sensors
 from pipeline.statistics.comparisons import table_comparisons
 from pipeline.types import FloorEstimate, ObservationSet, RadiusFloor, Split
@@ -59,7 +59,12 @@ def build_table(
     table = {
         "dataset": dataset_json(facts),
         "protocol": experiment.protocol,
-        "budget": {"name": experiment.budget, "steps": experiment.steps, "seeds": experiment.seeds},
+        "budget": {
+            "name": experiment.budget,
+            "steps": experiment.steps,
+            "seeds": experiment.seeds,
+            "own": _own_budgets(experiment, entries),
+        },
         "split": {
             "hash": split.hash,
             "folds": [{"train": list(fold.train), "test": list(fold.test)} for fold in split.folds],
@@ -165,6 +170,16 @@ def _against_floors(
     return {"brackets": brackets, "sensors": value_of_sensors(estimates, sights, brackets)}
 
 
+def _own_budgets(experiment: Experiment, entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Policy → its budget in words, for those that do not train as long as the benchmark says."""
+    policies = {e["variant"].name: e["variant"] for e in entries if e["variant"].family in experiment.policies}
+    return {
+        name: experiment.budget_of(variant)
+        for name, variant in policies.items()
+        if BUDGET & experiment.policies[variant.family].given.keys()
+    }
+
+
 def _seen_by(variant: Variant, observation_set: ObservationSet, experiment: Experiment) -> ObservationSet:
     """The observation set as a policy sees it: with as many frames as the policy was given, and with its camera."""
     policy = experiment.policies.get(variant.family)
@@ -210,6 +225,9 @@ def _row(entry: Mapping[str, Any], experiment: Experiment, facts: Mapping[str, A
         **{metric: metrics[metric] for metric in METRICS},
         "params": entry["parameters"],
         "train_s": entry["train_s"],
+        "steps": entry.get("steps"),
+        "cpu_s": entry.get("cpu_s"),
+        "vram_mb": entry.get("vram_mb"),
         "latency_ms": entry["latency_ms"],
         "verdict": {
             "vs_hold_still": None,

@@ -51,10 +51,11 @@ def facts(table: Table) -> list[list[str]]:
 
 
 def budget_words(table: Table) -> str:
-    """`quick (5 seeds × 600 steps)`"""
+    """`quick (5 seeds × 600 steps)`, and policies with a budget of their own after it."""
     budget = table["budget"]
     steps = f"{plural(budget['seeds'], 'seed')} × {plural(budget['steps'], 'step')}"
-    return f"{budget['name']} ({steps})" if budget["name"] else steps
+    own = "".join(f", {policy} {words}" for policy, words in budget.get("own", {}).items())
+    return (f"{budget['name']} ({steps})" if budget["name"] else steps) + own
 
 
 def notes(table: Table) -> list[str]:

@@ -296,11 +296,12 @@ def _footnotes(table: Mapping[str, Any]) -> list[str]:
 def _setting(table: Mapping[str, Any]) -> str:
     budget, folds = table["budget"], table["split"]["folds"]
     name = f"{budget['name']}, " if budget["name"] else ""
+    own = "".join(f", {policy} {words}" for policy, words in budget.get("own", {}).items())
     held_out = sum(len(fold["test"]) for fold in folds)
     split = f"{len(folds)} folds" if len(folds) > 1 else f"1 fold, {len(folds[0]['train'])} episodes train"
     return (
         f"protocol {table['protocol']} · budget {name}{budget['seeds']} seed{'s' * (budget['seeds'] != 1)} × "
-        f"{budget['steps']:,} steps · {split}, {held_out} held out"
+        f"{budget['steps']:,} steps{own} · {split}, {held_out} held out"
     )
 
 

@@ -85,9 +85,12 @@ def test_every_fold_and_every_later_training_has_the_recorded_steps(made):
     assert [weights_hash(folder / f"fold_{n}") for n in (0, 1)] == before
 
 
-def test_what_draws_is_scored_by_its_samples(made):
+def test_the_table_says_budgets_and_scores_of_samples(made):
     table = json.loads((made.plan().folder(Unit("benchmark_table")) / "table.json").read_text())
     rows = {row["policy"]: row for row in table["policies"]}
+    assert table["budget"]["own"] == {"net_k04": "0.2 CPU-seconds"}
+    assert rows["net_k04"]["steps"] == made.store.made(made.plan().folder(TRAINED)).summary["steps"] > 1
+    assert rows["net_k04"]["cpu_s"] > 0
     assert rows["net_k04"]["samples"] is None
     samples = rows["flow_k04"]["samples"]
     assert 0 < samples["energy"]["value"] < samples["of_one"]["value"]
