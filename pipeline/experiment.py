@@ -23,7 +23,7 @@ from pipeline.config import (
     hash_of,
 )
 from pipeline.errors import ConfigError, did_you_mean
-from pipeline.methods import EXTERNAL, METHODS, is_own
+from pipeline.methods import BUDGET, EXTERNAL, METHODS, is_own
 from pipeline.types import ObservationSet, Protocol
 
 
@@ -86,6 +86,11 @@ class Experiment(Settings):
     def budget_words(self) -> str:
         steps = f"{self.seeds} seed{'s' * (self.seeds != 1)} × {self.steps:,} steps"
         return f"{self.budget} ({steps})" if self.budget else steps
+
+    def has_own_budget(self, variant: Variant) -> bool:
+        """Whether a policy trains for another time than the benchmark says."""
+        policy = self.policies.get(variant.family)
+        return policy is not None and bool(BUDGET & policy.given.keys())
 
     def budget_of(self, variant: Variant) -> str:
         """How long one network of a policy trains: by its own budget, where it has one."""

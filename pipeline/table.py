@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.by_task import errors_by_task
 from pipeline.experiment import Experiment, Variant
 from pipeline.external.pairing import Rival, judge_with_elsewhere
-from pipeline.methods import BUDGET, METHODS
+from pipeline.methods import METHODS
 from pipeline.statistics.brackets import Scored, Sight, form_brackets, gap_to_floor, sight_of, value_of_sensors
 from pipeline.statistics.comparisons import table_comparisons
 from pipeline.types import FloorEstimate, ObservationSet, RadiusFloor, Split
@@ -172,12 +172,8 @@ def _against_floors(
 
 def _own_budgets(experiment: Experiment, entries: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """Policy → its budget in words, for those that do not train as long as the benchmark says."""
-    policies = {e["variant"].name: e["variant"] for e in entries if e["variant"].family in experiment.policies}
-    return {
-        name: experiment.budget_of(variant)
-        for name, variant in policies.items()
-        if BUDGET & experiment.policies[variant.family].given.keys()
-    }
+    variants = {e["variant"].name: e["variant"] for e in entries}
+    return {name: experiment.budget_of(v) for name, v in variants.items() if experiment.has_own_budget(v)}
 
 
 def _seen_by(variant: Variant, observation_set: ObservationSet, experiment: Experiment) -> ObservationSet:

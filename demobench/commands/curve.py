@@ -89,13 +89,16 @@ def _read(curve: Any, plan: Any, more: int, worthwhile: float) -> dict[str, Any]
     policy, observations, _ = curve.entry.split("/")
     e, folder = plan.experiment, plan.folder(curve)
     facts = plan.store.made(plan.folder(Unit("demonstrations"))).summary["inspect"]
-    trained = next(v for v in plan.variants if v.name == policy).is_trained
+    variant = next(v for v in plan.variants if v.name == policy)
+    trained = variant.is_trained
     said = read_curve(
         folder, fps=facts["fps"], protocol=e.protocol, trained=trained, unit=common_unit(facts["action_units"]),
         floors=floors_of(plan, observations), more=more, share=worthwhile,
     )  # fmt: skip
     names = {"dataset": plan.key, "policy": policy, "observations": observations, "protocol": e.protocol}
-    budget = {"budget": e.budget_words, "seeds": e.seeds if trained else 1, "steps": e.steps if trained else 0}
+    steps = plan.store.made(folder).summary["steps"] if trained else 0
+    words = f"{e.seeds} × {e.budget_of(variant)}" if e.has_own_budget(variant) else e.budget_words
+    budget = {"budget": words, "seeds": e.seeds if trained else 1, "steps": steps}
     pictures = {"pictures": [str(path) for path in sorted(folder.glob("*.png"))]}
     return {**names, **budget, "unit": common_unit(facts["action_units"]), **said.as_json(), **pictures}
 

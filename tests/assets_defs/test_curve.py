@@ -168,3 +168,16 @@ def test_a_curves_name_holds_its_sizes():
     assert unit.entry == "mlp_k01/pose/10-20"
     assert sizes_of(unit) == (10, 20)
     assert sizes_of(UNIT) == ()
+
+
+def test_a_budget_in_cpu_seconds_gives_every_size_the_steps_of_all_episodes(drawn, tmp_path):
+    benchmark, _, _ = drawn
+    policies = {"mlp": RAW["policies"]["mlp"] | {"cpu_seconds": 0.1, "settings": {"width": 16}}}
+    timed = TinyBenchmark(benchmark.folder, Store(tmp_path / "results").ensure(), RAW | {"policies": policies})
+    _, run, why = run_curve(timed)
+    assert run.is_success, why
+    plan = timed.plan()
+    trained = timed.store.made(plan.folder(Unit("mlp_k01/trained_policy", "state"))).summary
+    curve = timed.store.made(plan.folder(UNIT)).summary
+    assert curve["steps"] == trained["steps"] > 6
+    assert curve["checks"]["ends_in_the_table"][0]
