@@ -167,6 +167,8 @@ def predict(
     parts = []
     for number, fold in enumerate(task.split.folds):
         trained = train_policy(task.variant.method, task.windows(fold.train, fold), on_step=on_step, **task.training)
+        if task.steps is None:
+            task = task.with_steps(trained.steps)  # CPU-seconds: what they came to holds for every fold
         predicted = predict_policy(
             trained.policy, task.windows(fold.test, fold), name=task.variant.name,
             observations=task.observation_set.name, fold=number, seeds=task.seeds, horizons=task.horizons,

@@ -81,10 +81,6 @@ class Transform:
 
     # What is seen --------------------------------------------------------------------------------------------------------
 
-    def split(self, values: np.ndarray, asked_by: str = "What was asked for") -> Seen:
-        """[B, T, O] → feature key → [B, T, D]."""
-        return Seen(_split(self.widths, values), asked_by)
-
     def encode(self, values: np.ndarray) -> np.ndarray:
         """[B, T, O] raw → [B, F] float32.
 

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from pipeline.methods import METHODS
+
 LOADED = """
 import json, sys
 from assets_defs.definitions import defs
@@ -25,11 +27,7 @@ def test_definitions_load_without_heavy_modules(tmp_path):
     assert not set(HEAVY) & set(loaded["modules"])
 
 
-@pytest.mark.parametrize(
-    "method", ["hold_still", "mean_action", "constant_velocity", "nearest_neighbour", "mlp", "notebook_pusht"]
-)
+@pytest.mark.parametrize("method", METHODS)
 def test_every_method_is_where_the_dictionary_says(method):
-    from pipeline.methods import METHODS
-
     cls = METHODS[method].load_class()
     assert all(hasattr(cls, name) for name in ("fit", "predict", "arrays", "settings", "restore"))
