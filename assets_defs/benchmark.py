@@ -7,6 +7,8 @@ from pathlib import Path
 
 import dagster as dg
 
+from assets_defs.curve import KEY as CURVE
+from assets_defs.curve import read_kept
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
 from assets_defs.floor import ESTIMATES
 from assets_defs.plan import Unit
@@ -159,7 +161,7 @@ def _benchmark_report(benchmark_table: dg.AssetsDefinition) -> dg.AssetsDefiniti
         partitions_def=PARTITIONS,
         group_name="benchmark",
         kinds={"html", "altair"},
-        deps=[benchmark_table],
+        deps=[benchmark_table, CURVE],
         code_version=code_version("benchmark_report"),
         check_specs=[check_spec(REPORT, "self_contained", "The page asks for nothing from the network.")],
     )
@@ -180,6 +182,16 @@ def _benchmark_report(benchmark_table: dg.AssetsDefinition) -> dg.AssetsDefiniti
         return result(bench, REPORT, {"": made}, present(metadata), ["self_contained"])
 
     return benchmark_report
+
+
+def _curves(bench: Bench) -> dict:
+    """The learning curves that are up to date, by `policy/observations`; of several for one the last by its sizes."""
+    plan, variants = bench.plan, {v.name: v for v in bench.plan.variants}
+    found = {}
+    for unit in filter(plan.is_fresh, plan.curves()):
+        policy, observations, _ = unit.entry.split("/")
+        found[f"{policy}/{observations}"] = read_kept(bench, plan.folder(unit), variants[policy], observations)
+    return found
 
 
 def _write_report(bench: Bench, draft) -> Outcome:
@@ -204,6 +216,7 @@ def _write_report(bench: Bench, draft) -> Outcome:
         predictions,
         floors,
         [load_rollouts(plan.folder(u)) for u in rolled],
+        _curves(bench),
     )
     provenance = Provenance(
         command=bench.experiment.command + _choice_of_policies(bench, built),

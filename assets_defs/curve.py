@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import dagster as dg
 from pydantic import Field
@@ -17,6 +17,9 @@ from assets_defs.show import picture, present, table
 from pipeline.config import hash_of
 from pipeline.errors import ConfigError, did_you_mean
 from pipeline.experiment import Experiment, Variant
+
+if TYPE_CHECKING:
+    from pipeline.statistics.curve_reading import Reading
 
 KEY = dg.AssetKey(["learning_curve"])
 
@@ -198,19 +201,29 @@ def _describe(bench: Bench, task, draft: Path) -> dict[str, Any]:
     from pipeline.sinks.curve_chart import picture_curve
     from pipeline.sinks.words import common_unit
     from pipeline.statistics.curve import METRIC_WORDS
-    from pipeline.statistics.curve_reading import read_curve
     from pipeline.types import ACTION
 
     unit = common_unit(task.demos.features[ACTION].units)
-    protocol, trained = task.experiment.protocol, task.variant.is_trained
-    floors = floors_of(bench.plan, task.observation_set.name)
-    read = read_curve(draft, fps=task.demos.fps, protocol=protocol, trained=trained, unit=unit, floors=floors)
+    read = read_kept(bench, draft, task.variant, task.observation_set.name)
     for metric, points in read.points.items():
         picture_curve(
             points, draft / f"{metric}.png", what=METRIC_WORDS[metric].removeprefix("the "), unit=unit,
             policy=task.variant.name, everyone=[v.name for v in bench.plan.variants], floor=read.floors.get(metric),
         )  # fmt: skip
     return read.as_json()
+
+
+def read_kept(bench: Bench, folder: Path, variant: Variant, observations: str) -> "Reading":
+    """What the errors in a curve's folder say, with the floors of its observation set."""
+    from pipeline.sinks.words import common_unit
+    from pipeline.statistics.curve_reading import read_curve
+    from pipeline.types import ACTION
+
+    demos = bench.demonstrations
+    return read_curve(
+        folder, fps=demos.fps, protocol=bench.experiment.protocol, trained=variant.is_trained,
+        unit=common_unit(demos.features[ACTION].units), floors=floors_of(bench.plan, observations),
+    )  # fmt: skip
 
 
 def floors_of(plan: Plan, observations: str) -> list:

@@ -31,7 +31,7 @@ CODE_VERSIONS = {
     "rollouts": "1",
     "scored_predictions": "2",
     "benchmark_table": "4",
-    "benchmark_report": "5",
+    "benchmark_report": "6",
     "mcap_log": "1",
     "rerun_recording": "1",
 }
@@ -156,6 +156,13 @@ class Plan:
         there = [folder.parent.name for folder in self.folder(Unit(SCORED)).glob("[!.]*/made.json")]
         return [Unit(SCORED, name) for name in sorted({*there, *self.asked})]
 
+    def curves(self) -> list[Unit]:
+        """The learning curves in the store, of policies and observation sets that there still are."""
+        there = self.folder(Unit("learning_curve")).glob("[!.]*/[!.]*/[!.]*/made.json")
+        entries = [made.parent.parts[-3:] for made in sorted(there)]
+        known = {(v.name, s.name) for v in self.variants for s in self.experiment.sets_of(v)}
+        return [Unit("learning_curve", "/".join(entry)) for entry in entries if entry[:2] in known]
+
     def fresh_predictions(self) -> list[Unit]:
         """All predictions that are up to date, ours first."""
         return self.fresh_policy_units("predictions") + [u for u in self.scored_units() if self.is_fresh(u)]
@@ -166,7 +173,7 @@ class Plan:
         inputs = self.inputs(unit)
         if unit.asset in SUMMARIES:
             # A summary is made from whatever is up to date, so a policy that was never run does not hold it back.
-            inputs = [i for i in inputs if i.kind not in (*POLICY, SCORED) or self.is_fresh(i)]
+            inputs = [i for i in inputs if i.kind not in (*POLICY, SCORED, "learning_curve") or self.is_fresh(i)]
         prints = {}
         for i in inputs:
             if not self.is_fresh(i):
@@ -224,7 +231,8 @@ class Plan:
             case _:
                 policies = [u for v in self.variants for u in self.policy_units(v, "predictions")]
                 policies += self.scored_units()
-                return [*([Unit("benchmark_table")] if unit.kind == "benchmark_report" else []), *policies]
+                shown = [Unit("benchmark_table"), *self.curves()] if unit.kind == "benchmark_report" else []
+                return [*shown, *policies]
 
     def _asked_of_scored(self, unit: Unit) -> Mapping[str, Any]:
         """What the score of predictions made elsewhere depends on: as asked for now, else as when they were scored."""

@@ -55,6 +55,7 @@ def run_curve(
     read = [_read(curve, plan, more, worthwhile) for curve in curves]
     for curve, found in zip(curves, read, strict=True):
         _show(found, plan.folder(curve), session.console)
+    session.console.print(f"[dim]The report shows it from the next run on: demobench run {escape(target.key)}[/]")
     write_json_to(json_to, read[0] | {"others": read[1:]})
 
 

@@ -12,9 +12,11 @@ import altair as alt
 import numpy as np
 
 from pipeline.methods import METHODS
-from pipeline.sinks import bracket_chart, charts, planes
+from pipeline.sinks import bracket_chart, charts, curve_chart, planes
 from pipeline.sinks.findings import LOSSES, ahead, bracket_of, capital, floors_of, name_in, not_above, ranks, why_not
 from pipeline.sinks.words import common_unit, show
+from pipeline.statistics.curve import METRIC_WORDS
+from pipeline.statistics.curve_reading import Reading
 from pipeline.types import ACTION, STATE, Demonstrations, Predictions, RadiusFloor, Rollouts, Semantics
 
 POINTS = 400
@@ -49,15 +51,19 @@ def benchmark_figures(
     predictions: Sequence[Predictions],
     floors: Sequence[RadiusFloor] = (),
     rollouts: Sequence[Rollouts] = (),
+    curves: Mapping[str, Reading] | None = None,
 ) -> list[Figure]:
     """Every figure that this benchmark has data for, in the order in which a reader asks.
 
     Parameters:
         table: one object of `run --json`.
         predictions: at held-out anchors; figures of single predictions are left out where there are none.
+        curves: learning curves, by `policy/observations`.
     """
     everyone = _everyone(table)
-    figures = [bracket_figure(table), horizon_figure(table), chunk_figure(table)]
+    figures = [bracket_figure(table)]
+    figures += [curve_figure(table, name, reading) for name, reading in (curves or {}).items()]
+    figures += [horizon_figure(table), chunk_figure(table)]
     best = best_predictions(table, predictions)
     if best is not None:
         in_plane = _in_a_plane(semantics, demos)
@@ -67,6 +73,25 @@ def benchmark_figures(
         figures.append(scatter_figure(demos, semantics, best, everyone))
     figures += [rollout_figure(rollouts, demos), floor_figure(demos, semantics, floors), lag_figure(table)]
     return [figure for figure in figures if figure is not None]
+
+
+def curve_figure(table: Mapping[str, Any], address: str, reading: Reading) -> Figure:
+    """Error against training episodes, the first action and one second ahead, with the answer in words."""
+    policy, _, observations = address.partition("/")
+    unit = common_unit(table["dataset"]["action_units"])
+    panels = []
+    for metric, points in reading.points.items():
+        what = METRIC_WORDS[metric].removeprefix("the ")
+        chart = curve_chart.learning_curve(
+            points, what=what, unit=unit, policy=policy, everyone=_everyone(table), floor=reading.floors.get(metric)
+        )
+        panels.append(Panel(capital(what), chart))
+    said = " ".join(answer.words for answer in reading.answers)
+    how = (
+        f"{said} {policy} ({observations}) was trained on nested parts of the training episodes and scored on the same held-out "
+        "episodes. Thin lines are single orders of the episodes, bars 95 % intervals; dashed, where it is known, the floor."
+    )
+    return Figure("Would more demonstrations help?", how, tuple(panels))
 
 
 def by_observation_set(table: Mapping[str, Any]) -> dict[str, list[Row]]:

@@ -181,3 +181,20 @@ def test_a_budget_in_cpu_seconds_gives_every_size_the_steps_of_all_episodes(draw
     curve = timed.store.made(plan.folder(UNIT)).summary
     assert curve["steps"] == trained["steps"] > 6
     assert curve["checks"]["ends_in_the_table"][0]
+
+
+def test_the_report_shows_the_curve_from_the_next_run_on(tmp_path):
+    folder = write_v3(tmp_path / "tiny", tiny_recording(episodes=14, frames=25))
+    benchmark = TinyBenchmark(folder, Store(tmp_path / "results").ensure(), RAW)
+    benchmark.run(policies=("mlp",))
+    page = benchmark.plan().folder(Unit("benchmark_report")) / "report.html"
+    assert "Would more demonstrations help?" not in page.read_text()
+    _, run, why = run_curve(benchmark)
+    assert run.is_success, why
+    assert benchmark.run(policies=("mlp",))[0] == ["benchmark_report"]
+    shown = page.read_text()
+    assert "Would more demonstrations help?" in shown
+    said = benchmark.store.made(benchmark.plan().folder(UNIT)).summary["answers"][0]["words"]
+    assert said.split(":")[0] in shown
+    forgotten = TinyBenchmark(folder, benchmark.store, {**RAW, "policies": {"mlp": {"method": "mlp", "chunks": [4]}}})
+    assert forgotten.plan().curves() == []
