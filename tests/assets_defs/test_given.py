@@ -60,6 +60,15 @@ def test_what_matters_to_its_weights_makes_it_stale_and_nothing_else(made, chang
     assert stale(made, with_net(**changes)) == {"net_k04/trained_policy"}
 
 
+def test_a_file_of_derived_features_is_watched(made, tmp_path):
+    prints = [made.plan().fingerprint(TRAINED)]
+    for factor in (1, 2):
+        (tmp_path / "mine.py").write_text(f"def far(seen): return {factor} * seen['observation.state'][:, -1]")
+        raw = with_net(features=f"{tmp_path / 'mine.py'}:far")
+        prints.append(TinyBenchmark(made.folder, made.store, raw).plan().fingerprint(TRAINED))
+    assert len(set(prints)) == 3
+
+
 def test_a_default_that_is_written_out_changes_nothing(made):
     assert stale(made, with_net(settings={"blocks": 1, "width": 16, "dropout": 0.0, "loss": "l1"})) == set()
 
