@@ -66,3 +66,10 @@ def test_the_hash_covers_every_estimator_that_a_study_reaches():
         waiting += [folder / f"{name}.py" for name in found - reached]
         reached |= found
     assert reached - {"trials"} == set(module.ESTIMATORS)  # trials read files; no study has one
+
+
+def test_words_do_not_make_shards_again():
+    code = "def f(x):\n    return x + 1\n"
+    same = '"""A page."""\n\ndef f(x):\n    """Adds."""\n    return x + 1  # one\n\nX = 3\n"""About X."""\n'
+    assert module.without_words(same) == module.without_words(code + "X = 3\n")
+    assert module.without_words(code) != module.without_words(code.replace("1", "2"))
