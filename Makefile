@@ -23,6 +23,9 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[pusht,so101,dev]'
 	touch $@
 
+# Two test processes whose matrix products each want both cores wait for each other for most of their time.
+test test-slow: export OPENBLAS_NUM_THREADS = 1
+
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 -m "not slow"
 

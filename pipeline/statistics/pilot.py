@@ -6,9 +6,9 @@ not: what is made of the differences that it leaves (`floors`).
 Two neighbours do different things for two reasons: they are not quite in the same place, and people disagree. For any function
 m̂ of the place that knows nothing of either action, the actions less m̂ disagree as the actions do, and the difference of
 places counts only as far as m̂ is wrong. That is prewhitening (Press & Tukey 1956): flatten what can be flattened, then
-extrapolate what is left. A bad m̂ gains little, and where it adds more than it takes away `floors` refuses. One that has seen either action would take noise away with the
-mean; so episodes are dealt into folds, and a pair is asked of the regression that saw neither's fold (cross-fitting:
-Chernozhukov et al. 2018).
+extrapolate what is left. A bad m̂ gains little, and where it adds more than it takes away `floors` refuses. One that has seen
+either action would take noise away with the mean; so episodes are dealt into folds, and a pair is asked of the regression that
+saw neither's fold (cross-fitting: Chernozhukov et al. 2018).
 
 The regression is ridge on random cosines (Rahimi & Recht 2007): sums over frames, so that all pairs of folds cost little more
 than one fit.
