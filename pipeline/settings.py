@@ -108,6 +108,7 @@ class ActSettings(TrainingSettings):
     latent: Annotated[int, Field(ge=1, le=1024)] = 32
     kl: NotNegative = 10.0
     dropout: Share = 0.1
+    batch: Count = 64
     learning_rate: Positive = 3e-4
 
     @model_validator(mode="after")

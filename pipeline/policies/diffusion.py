@@ -4,10 +4,11 @@ What belongs here: the noise process of training (DDPM, Ho et al. 2020, with the
 the sampling (DDIM, Song et al. 2021, without noise on the way). What does not: training (`networks`), the body's layers
 (`body`).
 
-Departures from Diffusion Policy: a residual perceptron over the whole chunk instead of a 1-D U-Net or transformer; actions are
-scaled by deviations, so the estimate of the clean actions is clamped at the largest of each training target rather than at ±1.
-Without a clamp the first step, which divides by almost nothing, throws answers far away. The process is thirty lines; the
-package that others take it from would bring more to own than that.
+Departures from Diffusion Policy: a residual perceptron over the whole chunk instead of a 1-D U-Net or transformer; the
+network predicts the velocity of Salimans & Ho (2022) instead of the noise, because at the first of few sampling steps clean
+actions would be a difference over almost nothing; actions are scaled by deviations, so the estimate of the clean ones is
+clamped at the largest of each training target rather than at ±1. The process is thirty lines; the package that others take it
+from would bring more to own than that.
 """
 
 import math
@@ -41,23 +42,24 @@ class _Diffusion(Net):
         self.register_buffer("limit", torch.tensor(shape.limit), persistent=False)
         self.visited = torch.linspace(self.steps - 1, 0, settings.sampling_steps).round().long().tolist()
 
-    def noise_in(self, inputs: torch.Tensor, points: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """The noise that is thought to be in points [B, K · A'] after `step` [B]."""
+    def velocity(self, inputs: torch.Tensor, points: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        """√ᾱ · noise − √(1 − ᾱ) · clean actions, as thought to be at points [B, K · A'] after `step` [B]."""
         return self.body(torch.cat([inputs, points, waves(step / self.steps)], dim=1)).float()
 
     def loss(self, inputs: torch.Tensor, targets: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-        """How far that is from the noise that is, squared, after a random number of steps."""
+        """How far that is from what it is, squared, after a random number of steps."""
         step = torch.randint(self.steps, (len(targets),), device=targets.device)
         noise, kept = torch.randn_like(targets), self.kept[step, None]
         points = kept.sqrt() * targets + (1 - kept).sqrt() * noise
-        return masked_mean((self.noise_in(inputs, points, step) - noise).square(), mask)
+        velocity = kept.sqrt() * noise - (1 - kept).sqrt() * targets
+        return masked_mean((self.velocity(inputs, points, step) - velocity).square(), mask)
 
     def answer(self, inputs: torch.Tensor, noise: torch.Tensor | None) -> torch.Tensor:
         points = noise
         for step, then in zip(self.visited, [*self.visited[1:], None], strict=True):
             kept = self.kept[step]
-            found = self.noise_in(inputs, points, torch.full((len(inputs),), step))
-            clean = (points - (1 - kept).sqrt() * found) / kept.sqrt()
+            velocity = self.velocity(inputs, points, torch.full((len(inputs),), step))
+            clean = kept.sqrt() * points - (1 - kept).sqrt() * velocity
             clean = torch.minimum(torch.maximum(clean, -self.limit), self.limit)
             if then is None:
                 return clean
