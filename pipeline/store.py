@@ -16,7 +16,7 @@ import os
 import shutil
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -166,12 +166,26 @@ class Store:
             ) from None
 
 
+@contextmanager
+def drafted(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path`; when the block ends well it takes the place of `path`, else it is removed.
+
+    The one way to write a file whole or not at all.
+    """
+    draft = path.with_name(f".{path.stem}.{os.getpid()}.draft{path.suffix}")
+    try:
+        yield draft
+        draft.replace(path)
+    finally:
+        with suppress(OSError):
+            draft.unlink()
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write JSON whole or not at all; keys keep their order, which means something (observation sets, joints)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
-    draft.write_text(json.dumps(value, indent=1, allow_nan=False), encoding="utf-8")
-    draft.replace(path)
+    with drafted(path) as draft:
+        draft.write_text(json.dumps(value, indent=1, allow_nan=False), encoding="utf-8")
 
 
 class Meter:

@@ -7,7 +7,7 @@ import psutil
 import pytest
 
 from pipeline.errors import ConfigError, StoreError
-from pipeline.store import Made, Meter, Store
+from pipeline.store import Made, Meter, Store, drafted, write_json
 
 
 @pytest.fixture
@@ -69,6 +69,20 @@ def test_a_file_in_the_way_is_one_message(tmp_path):
     (tmp_path / "results").write_text("not a folder")
     with pytest.raises(StoreError, match="cannot be written to .* choose another folder with --store"):
         Store(tmp_path / "results").ensure()
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "page.html"
+    with drafted(path) as draft:
+        assert draft.suffix == ".html", "what writes by the ending of a name still can"
+        draft.write_text("one")
+        assert not path.exists()
+    with pytest.raises(ZeroDivisionError), drafted(path) as draft:
+        draft.write_text(str(1 / 0))
+    with pytest.raises(ValueError, match="Out of range float"):
+        write_json(path, float("nan"))
+    assert path.read_text() == "one"
+    assert [p.name for p in tmp_path.iterdir()] == ["page.html"], "no drafts left behind"
 
 
 def test_keys_cannot_walk_out(store):

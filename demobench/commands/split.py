@@ -1,7 +1,6 @@
 """`demobench split`: which episodes train and which are held out, also in the form that other trainers take."""
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -10,8 +9,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from demobench.commands.session import open_session, write_json_to
+from demobench.commands.session import open_dataset, open_session, write_json_to
 from pipeline.errors import ConfigError, StoreError
+from pipeline.store import drafted
 from pipeline.types import Demonstrations, Split
 
 Format = Literal["text", "json", "lerobot"]
@@ -34,7 +34,6 @@ def run_split(
     ------
     ConfigError : no such fold.
     """
-    from demobench.commands.session import open_dataset
     from pipeline.experiment import Choices
     from pipeline.folds import split_of
 
@@ -118,11 +117,8 @@ def _as_text(found: Mapping[str, Any]) -> str:
 
 def _write(path: Path, text: str) -> None:
     """Write whole or not at all."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
     try:
-        draft.write_text(text, encoding="utf-8")
-        draft.replace(path)
+        with drafted(path) as draft:
+            draft.write_text(text, encoding="utf-8")
     except OSError as error:
         raise StoreError(f"The split cannot be written to {path}: {error.strerror}.") from None
-    finally:
-        draft.unlink(missing_ok=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import NotApplicableError, StoreError
+from pipeline.store import drafted
 from pipeline.types import ACTION, Demonstrations, Protocol, Split
 
 NO_FOLD = -1
@@ -71,15 +72,12 @@ def write_anchors(
         "fold": fold_of_episodes(split, demos.episodes)[of_anchor],
     }
     rows = pa.table(columns).replace_schema_metadata({METADATA: json.dumps(described).encode()})
-    draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
     try:
-        pq.write_table(rows, draft)
-        draft.replace(path)
+        with drafted(path) as draft:
+            pq.write_table(rows, draft)
     except OSError as error:
         why = os.strerror(error.errno) if error.errno else str(error)  # arrow's own words name the draft
         raise StoreError(
             f"The anchors cannot be written to {path}: {why}. Name a file in a folder that is there."
         ) from None
-    finally:
-        draft.unlink(missing_ok=True)
     return len(anchors)

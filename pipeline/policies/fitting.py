@@ -8,10 +8,9 @@ policies (`pipeline.train`).
 import hashlib
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from safetensors.torch import save_file
 from pipeline.errors import PolicyError, StoreError
 from pipeline.policies import Curve, Plan
 from pipeline.policies.batched import Stack
+from pipeline.store import drafted, write_json
 from pipeline.types import ACTION
 from pipeline.windows import Windows
 
@@ -221,14 +221,11 @@ class Training:
             "fingerprint": self.fingerprint, "done": self.done, "seconds": self.seconds, "cpu_seconds": self.cpu_seconds,
             "steps": self.steps, "losses": self.logged,
         }  # fmt: skip
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            save_file(tensors, temporary, metadata={"progress": json.dumps(progress)})
-            temporary.replace(path)
+            with drafted(path) as draft:
+                save_file(tensors, draft, metadata={"progress": json.dumps(progress)})
         except (OSError, SafetensorError) as error:
-            with suppress(OSError):
-                temporary.unlink()
             raise StoreError(f"The checkpoint {path} cannot be written ({error}). Make room, then run again.") from None
 
     def _resume(self, path: Path) -> None:
@@ -302,10 +299,7 @@ def settle_steps(plan: Plan, make: Callable[[], Training]) -> Plan:
     if steps is None:
         steps = _try_out(make(), plan)
         if plan.recorded is not None:
-            plan.recorded.parent.mkdir(parents=True, exist_ok=True)
-            draft = plan.recorded.with_name(f".{plan.recorded.name}.{os.getpid()}")
-            draft.write_text(json.dumps({"cpu_seconds": plan.cpu_seconds, "steps": steps}))
-            draft.replace(plan.recorded)
+            write_json(plan.recorded, {"cpu_seconds": plan.cpu_seconds, "steps": steps})
     return replace(plan, steps=steps, cpu_seconds=None)
 
 

@@ -3,12 +3,12 @@
 `replacing` is the one way a sink puts a file in its place: written whole beside it, then renamed.
 """
 
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.errors import StoreError
+from pipeline.store import drafted
 
 
 @contextmanager
@@ -18,16 +18,12 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         StoreError: the folder cannot be created or the file cannot be written.
     """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        temporary.replace(path)
+        with drafted(path) as temporary:
+            yield temporary
     except OSError as error:
         raise StoreError(
             f"{path} cannot be written: {error.strerror or error}. Free some space or choose another folder with "
             "--store."
         ) from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink()

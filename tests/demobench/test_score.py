@@ -113,7 +113,7 @@ def test_a_mistake_is_one_message_before_any_work(unused, monkeypatch, words, ex
     for expectation in expected:
         assert expectation in str(found.exception)
     assert not list(unused.rglob("made.json"))
-    assert not list(unused.rglob("*.draft"))
+    assert not list(unused.rglob("*.draft*"))
 
 
 def test_anchors_are_written_for_all_episodes_or_a_fold(unused, monkeypatch):
