@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config import BUDGETS, DatasetConfig, find_config, load_config, parse_config
 from pipeline.errors import ConfigError, did_you_mean
 from pipeline.experiment import Choices, Experiment, Variant, resolve_target, variants
+from pipeline.methods import EXTERNAL, METHODS
 from pipeline.types import (
     Demonstrations,
     EpisodeErrors,
@@ -160,20 +161,16 @@ def predict(
     on_step : called with (step, steps, loss) now and then, for each fold anew.
     given : further keys of `[policies.<name>]`: history, actions, features, augment, steps, cpu_seconds.
     """
-    from pipeline.predict import join_folds, predict_policy
-    from pipeline.train import train_policy
+    from pipeline.folds import predict_fold, train_fold
+    from pipeline.predict import join_folds
 
     task = _task(data, method, chunk, observations, name, {"settings": dict(settings or {}), **given})
     parts = []
     for number, fold in enumerate(task.split.folds):
-        trained = train_policy(task.variant.method, task.windows(fold.train, fold), on_step=on_step, **task.training)
+        trained = train_fold(task, fold, on_step=on_step)
         if task.steps is None:
             task = task.with_steps(trained.steps)  # CPU-seconds: what they came to holds for every fold
-        predicted = predict_policy(
-            trained.policy, task.windows(fold.test, fold), name=task.variant.name,
-            observations=task.observation_set.name, fold=number, seeds=task.seeds, horizons=task.horizons,
-        )  # fmt: skip
-        parts.append(predicted)
+        parts.append(predict_fold(task, trained.policy, number, task.windows(fold.test, fold)))
     return join_folds(parts)
 
 
@@ -222,7 +219,7 @@ def _score_file(data: Dataset, path: Path, name: str | None, trained_on: Path | 
 
     found = score_file(
         path, name=name or path.stem, observations=None,
-        training=read_training(Path(trained_on), data.demos) if trained_on else None, demos=data.demos,
+        training=read_training(Path(trained_on) if trained_on else None, data.demos), demos=data.demos,
         semantics=data.semantics, split=split(data), experiment=data.experiment,
     )  # fmt: skip
     address = f"{found.predictions.policy}/{found.predictions.observations}"
@@ -263,7 +260,6 @@ def _task(
 ) -> "PolicyTask":
     """A policy of the configuration's methods, whether or not the file has it."""
     from pipeline.folds import PolicyTask
-    from pipeline.methods import METHODS
 
     if method not in METHODS:
         raise ConfigError(f"No method '{method}'. {did_you_mean(method, METHODS)}")
@@ -282,6 +278,6 @@ def _task_of(data: Dataset, predictions: Predictions) -> "PolicyTask":
     """The task that predictions answer, by the policy's name."""
     known: dict[str, Variant] = {v.name: v for v in data.experiment.variants}
     name, chunk = predictions.policy, predictions.actions.shape[2]
-    variant = known.get(name) or Variant(name, name, "external", chunk)
+    variant = known.get(name) or Variant(name, name, EXTERNAL, chunk)
     task = _task(data, "hold_still", None, predictions.observations)
     return replace(task, variant=variant)

@@ -16,8 +16,9 @@ import numpy as np
 
 from pipeline.errors import ConfigError, NotApplicableError
 from pipeline.experiment import Variant
-from pipeline.folds import PolicyTask
+from pipeline.folds import PolicyTask, predict_fold, train_fold
 from pipeline.methods import METHODS
+from pipeline.store import drafted
 from pipeline.types import Fold, Predictions, Split
 
 ORDERS = 3
@@ -140,9 +141,8 @@ def train_subsets(
         if not path.exists():
             part = subset_task(task, subset)
             predictions = predict_subset(part, subset, kept / "checkpoint.safetensors", report)
-            draft = path.with_name(f".{path.name}")
-            keep(part, predictions, draft)
-            draft.rename(path)
+            with drafted(path) as draft:
+                keep(part, predictions, draft)
         if report is not None:
             report(steps, steps, float("nan"))
     (kept / "checkpoint.safetensors").unlink(missing_ok=True)
@@ -162,23 +162,6 @@ def predict_subset(
     task: PolicyTask, subset: Subset, checkpoint: Path, on_step: Callable[[int, int, float], None] | None = None
 ) -> Predictions:
     """Train on one subset (`task` is its `subset_task`) and predict at the held-out anchors of its fold."""
-    from pipeline.predict import predict_policy
-    from pipeline.train import train_policy
-
     fold = task.split.folds[subset.fold]
-    trained = train_policy(
-        task.variant.method,
-        task.windows(fold.train, fold),
-        checkpoint=checkpoint,
-        on_step=on_step,
-        **task.training,
-    )
-    return predict_policy(
-        trained.policy,
-        task.windows(fold.test, fold),
-        name=task.variant.name,
-        observations=task.observation_set.name,
-        fold=subset.fold,
-        seeds=task.seeds,
-        horizons=task.horizons,
-    )
+    trained = train_fold(task, fold, checkpoint=checkpoint, on_step=on_step)
+    return predict_fold(task, trained.policy, subset.fold, task.windows(fold.test, fold))

@@ -106,6 +106,42 @@ def split_of(experiment: Experiment, demos: Demonstrations) -> Split:
     )
 
 
+def train_fold(
+    task: PolicyTask,
+    fold: Fold,
+    *,
+    checkpoint: Path | None = None,
+    recorded: Path | None = None,
+    on_step: Callable[[int, int, float], None] | None = None,
+) -> "Trained":
+    """Train on the episodes of one fold; `checkpoint`, `recorded` and `on_step` as for `train_policy`."""
+    from pipeline.train import train_policy
+
+    return train_policy(
+        task.variant.method,
+        task.windows(fold.train, fold),
+        checkpoint=checkpoint,
+        recorded=recorded,
+        on_step=on_step,
+        **task.training,
+    )
+
+
+def predict_fold(task: PolicyTask, policy: Any, number: int, held_out: Windows) -> Predictions:
+    """What the policy of fold `number` answers at the windows that it held out."""
+    from pipeline.predict import predict_policy
+
+    return predict_policy(
+        policy,
+        held_out,
+        name=task.variant.name,
+        observations=task.observation_set.name,
+        fold=number,
+        seeds=task.seeds,
+        horizons=task.horizons,
+    )
+
+
 def train_folds(
     task: PolicyTask,
     folder: Path,
@@ -119,20 +155,19 @@ def train_folds(
     `on_step(done, total, loss)` counts the steps of all folds. `recorded` is the file that remembers how many steps a budget in
     CPU-seconds came to: they are those of the first fold for all, and of any later training of the same result.
     """
-    from pipeline.train import load_trained, save_trained, train_policy
+    from pipeline.train import load_trained, save_trained
 
     folds = task.split.folds
     results = []
     for number, fold in enumerate(folds):
         kept = unfinished / f"fold_{number}"
         if not kept.exists():
-            trained = train_policy(
-                task.variant.method,
-                task.windows(fold.train, fold),
+            trained = train_fold(
+                task,
+                fold,
                 checkpoint=unfinished / "checkpoint.safetensors",
                 on_step=None if on_step is None else _counting_from(on_step, number, len(folds)),
                 recorded=recorded or unfinished / "steps.json",
-                **task.training,
             )
             draft = kept.with_name(f".{kept.name}")
             save_trained(trained, draft)
@@ -153,7 +188,7 @@ def predict_folds(task: PolicyTask, trained: Path) -> tuple[Predictions, dict[st
 
     Also returns `latency_ms` of one call, and `windows_train` and `windows_test`, summed over folds.
     """
-    from pipeline.predict import join_folds, latency_ms, predict_policy
+    from pipeline.predict import join_folds, latency_ms
     from pipeline.train import load_trained
 
     parts = []
@@ -161,16 +196,7 @@ def predict_folds(task: PolicyTask, trained: Path) -> tuple[Predictions, dict[st
     for number, fold in enumerate(task.split.folds):
         policy = load_trained(trained / f"fold_{number}").policy
         held_out = task.windows(fold.test, fold)
-        predicted = predict_policy(
-            policy,
-            held_out,
-            name=task.variant.name,
-            observations=task.observation_set.name,
-            fold=number,
-            seeds=task.seeds,
-            horizons=task.horizons,
-        )
-        parts.append(predicted)
+        parts.append(predict_fold(task, policy, number, held_out))
         facts["windows_train"] += len(task.windows(fold.train, fold))
         facts["windows_test"] += len(held_out)
         facts["latency_ms"] = facts["latency_ms"] or latency_ms(policy, held_out)
