@@ -46,11 +46,9 @@ def run_curve(
         stale = plan.stale(plan.curve_units(curves))
         if stale:
             _check_sizes(target, plan, session, asked)
-            ops = {"learning_curve": {"sizes": list(asked)}}
-            sets = tuple(curve.entry.split("/")[1] for curve in curves)
-            materialise(replace(target, observations=sets), session, list(stale), job="curve", ops=ops)
-        else:
-            session.console.print(f"[bold]{target.key}[/] is up to date: nothing to compute.")
+        ops = {"learning_curve": {"sizes": list(asked)}}
+        sets = tuple(curve.entry.split("/")[1] for curve in curves)
+        materialise(replace(target, observations=sets), session, list(stale), job="curve", ops=ops)
     plan.forget()
     read = [_read(curve, plan, more, worthwhile) for curve in curves]
     for curve, found in zip(curves, read, strict=True):

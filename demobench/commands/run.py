@@ -66,11 +66,7 @@ def _run_one(target: Target, session: Session) -> dict[str, Any]:
     )
     with store.lock(target.key):
         store.register(target.key, target.experiment.model_dump(mode="json"))
-        stale = plan.stale()
-        if stale:
-            materialise(target, session, list(stale))
-        else:
-            console.print(f"[bold]{target.key}[/] is up to date: nothing to compute.")
+        materialise(target, session, list(plan.stale()))
     plan.forget()
     report = collect(target, plan, session)
     show(report, target, session)
@@ -92,13 +88,18 @@ def materialise(
     job: str | None = None,
     ops: Mapping[str, Any] | None = None,
 ) -> None:
-    """Make stale results as a Dagster run of a job (the benchmark by default) with bars; `ops` are settings of single assets.
+    """Make stale results as a Dagster run of a job (the benchmark by default) with bars; say so where there are none.
+
+    `ops` are settings of single assets.
 
     Raises:
         StoreError: the run's log cannot be written.
         DemobenchError: what the run failed for.
         typer.Exit: Ctrl-C.
     """
+    if not stale:
+        session.console.print(f"[bold]{target.key}[/] is up to date: nothing to compute.")
+        return
     from sqlalchemy.exc import SQLAlchemyError
 
     from demobench.progress import RunProgress
