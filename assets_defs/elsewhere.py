@@ -59,8 +59,12 @@ class Request:
         from pipeline.external.reading import hash_file
         from pipeline.external.training import read_training
 
-        training = read_training(self.trained_on, demos).identity() if self.trained_on else None
-        return {"sha256": hash_file(self.predictions), "trained_on": training, "observations": self.observations}
+        training = read_training(self.trained_on, demos)
+        return {
+            "sha256": hash_file(self.predictions),
+            "trained_on": training and training.identity(),
+            "observations": self.observations,
+        }
 
 
 def check_name(name: str, experiment: Experiment) -> None:
@@ -160,7 +164,7 @@ def _score(bench: Bench, request: Request, draft: Path) -> Outcome:
         request.predictions,
         name=request.name,
         observations=request.observations,
-        training=read_training(request.trained_on, demos) if request.trained_on else None,
+        training=read_training(request.trained_on, demos),
         demos=demos,
         semantics=bench.semantics,
         split=bench.split,

@@ -251,9 +251,9 @@ def _episodes_to_ask(opened: Opened, trained_on: Path | None) -> list[int]:
 
     demos = opened.demos
     held_out = sorted(e for fold in split_of(opened.target.experiment, demos).folds for e in fold.test)
-    if trained_on is None:
-        return held_out
     training = read_training(trained_on, demos)
+    if training is None:
+        return held_out
     lists = list(training.episodes.values())
     if None in lists or len(lists) > 1:
         return held_out
@@ -327,21 +327,13 @@ def _score(opened: Opened, request: "Request", json_to: str | None) -> None:
 
 def _check(opened: Opened, request: "Request") -> None:
     """Whatever is wrong with the file is said before anything is computed."""
-    from pipeline.external.scoring import score_file
+    from pipeline.external.scoring import admit_file
     from pipeline.external.training import read_training
-    from pipeline.folds import split_of
 
-    experiment, demos = opened.target.experiment, opened.demos
-    score_file(
-        request.predictions,
-        name=request.name,
-        observations=request.observations,
-        training=read_training(request.trained_on, demos) if request.trained_on else None,
-        demos=demos,
-        semantics=opened.semantics,
-        split=split_of(experiment, demos),
-        experiment=experiment,
-    )
+    admit_file(
+        request.predictions, training=read_training(request.trained_on, opened.demos), demos=opened.demos,
+        semantics=opened.semantics, experiment=opened.target.experiment,
+    )  # fmt: skip
 
 
 def _make_stale(opened: Opened, plan: "Plan", request: "Request | None") -> None:
@@ -351,9 +343,6 @@ def _make_stale(opened: Opened, plan: "Plan", request: "Request | None") -> None
     session, target = opened.session, opened.target
     session.store.register(target.key, target.experiment.model_dump(mode="json"))
     stale = list(plan.stale())
-    if not stale:
-        session.console.print(f"[bold]{target.key}[/] is up to date: nothing to compute.")
-        return
     chosen = replace(target, selected=tuple(v for v in target.experiment.variants if v.name in plan.selected))
     scores = request is not None and any(unit.asset == SCORED for unit in stale)
     materialise(chosen, session, stale, job=SCORE, ops={SCORED: request.config()} if scores else None)

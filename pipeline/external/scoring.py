@@ -19,10 +19,10 @@ from pipeline.external.training import HeldOut, Training, held_out_of
 from pipeline.folds import PolicyTask
 from pipeline.methods import EXTERNAL
 from pipeline.normalize import circular_columns
-from pipeline.sampling import deviations, summarise_samples
-from pipeline.statistics.distributions import score_samples
+from pipeline.sampling import score_draws
 from pipeline.statistics.metrics import Score, score_task
 from pipeline.types import ACTION, Demonstrations, Fold, Predictions, Semantics, Split
+from pipeline.windows import Windows
 
 ELSEWHERE = "elsewhere"
 """The observation set of a row that does not say what its policy sees."""
@@ -62,18 +62,23 @@ class Scored:
         }
 
 
-def score_file(
-    path: Path,
-    *,
-    name: str,
-    observations: str | None,
-    training: Training | None,
-    demos: Demonstrations,
-    semantics: Semantics,
-    split: Split,
-    experiment: Experiment,
-) -> Scored:
-    """Read, check and score a file of predictions.
+@dataclass(frozen=True)
+class Admitted:
+    """A file of predictions that was read and found aligned with what was recorded; `warnings` as in `Scored`.
+
+    actions  [S, M, K, A] those of the answers, of several samples their mean
+    """
+
+    answers: Answers
+    actions: np.ndarray
+    held_out: HeldOut
+    warnings: tuple[str, ...]
+
+
+def admit_file(
+    path: Path, *, training: Training | None, demos: Demonstrations, semantics: Semantics, experiment: Experiment
+) -> Admitted:
+    """Read and check a file of predictions: all that can be wrong with it, before anything is worked out.
 
     Raises
     ------
@@ -89,15 +94,36 @@ def score_file(
     if faults.refuse:
         raise DatasetError(f"{path}: {'; '.join(faults.refuse)}.")
     held_out = held_out_of(answers.covered, answers.fold, training, demos)
+    return Admitted(answers, actions, held_out, (*answers.notes, *faults.warn))
+
+
+def score_file(
+    path: Path,
+    *,
+    name: str,
+    observations: str | None,
+    training: Training | None,
+    demos: Demonstrations,
+    semantics: Semantics,
+    split: Split,
+    experiment: Experiment,
+) -> Scored:
+    """Read, check and score a file of predictions.
+
+    Raises
+    ------
+    DatasetError, ConfigError, NotApplicableError : as `admit_file`.
+    """
+    admitted = admit_file(path, training=training, demos=demos, semantics=semantics, experiment=experiment)
+    answers, held_out = admitted.answers, admitted.held_out
     keep = np.isin(demos.episode_of_frame[answers.anchors], held_out.episodes)
     anchors = answers.anchors[keep]
     at = np.searchsorted(held_out.episodes, demos.episode_of_frame[anchors])
     label = observations or ELSEWHERE
-    predictions = Predictions(name, label, answers.seeds, anchors, held_out.fold[at], actions[:, keep])
+    predictions = Predictions(name, label, answers.seeds, anchors, held_out.fold[at], admitted.actions[:, keep])
     task = _task(name, predictions, held_out, demos, semantics, split, experiment)
-    samples = _score_samples(answers, keep, held_out, demos, circular) if answers.actions.shape[1] > 1 else None
-    warnings = (*answers.notes, *faults.warn)
-    return Scored(task, predictions, score_task(task, predictions), held_out, samples, warnings)
+    score, samples = score_task(task, predictions), _score_samples(task, answers)
+    return Scored(task, predictions, score, held_out, samples, admitted.warnings)
 
 
 def _task(
@@ -116,20 +142,13 @@ def _task(
     return PolicyTask(demos, semantics, Split(tuple(folds), split.seed, split.hash), seen, variant, experiment)
 
 
-def _score_samples(
-    answers: Answers, keep: np.ndarray, held_out: HeldOut, demos: Demonstrations, circular: np.ndarray
-) -> dict[str, Any]:
-    """The scores of the samples at every step of the chunk, as those of policies trained here (`pipeline.sampling`)."""
-    anchors, actions = answers.anchors[keep], answers.actions[:, :, keep]
-    seeds, count, _, steps, _ = actions.shape
-    episode = demos.episode_of_frame[anchors]
-    found = {name: np.full((steps, seeds, len(anchors)), np.nan) for name in ("energy", "of_mean", "of_one")}
-    for step in range(steps):
-        inside = np.flatnonzero(anchors + step < demos.episode_starts[episode + 1])
-        if len(inside):
-            recorded = demos.columns[ACTION][anchors[inside] + step]
-            scores = score_samples(actions[:, :, inside, step], recorded, circular=circular, scale=deviations(demos))
-            for name, values in found.items():
-                values[step][:, inside] = getattr(scores, name)
-    fold = held_out.fold[np.searchsorted(held_out.episodes, episode)]
-    return summarise_samples(found, episode, fold, one_second=round(demos.fps), count=count, demos=demos)
+def _score_samples(task: PolicyTask, answers: Answers) -> dict[str, Any] | None:
+    """The scores of the samples at every step of the chunk, at all anchors that are scored; None where there is one sample."""
+    count = answers.actions.shape[1]
+    if count == 1:
+        return None
+
+    def draw(windows: Windows, at: np.ndarray) -> np.ndarray:
+        return answers.actions[:, :, np.searchsorted(answers.anchors, windows.anchors[at])]
+
+    return score_draws(task, lambda fold: draw, count=count)

@@ -50,12 +50,14 @@ def lerobot_training_file(checkpoint: Path) -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def read_training(path: Path, demos: Demonstrations) -> Training:
-    """Read what a policy was trained on.
+def read_training(path: Path | None, demos: Demonstrations) -> Training | None:
+    """Read what a policy was trained on; without a file nothing is known.
 
     Raises:
         ConfigError: the file is none of the three, is of other data, or names episodes that the data set lacks.
     """
+    if path is None:
+        return None
     value = _read_json(path)
     if isinstance(value, list):
         found = Training({EVERY_FOLD: _numbers(value, path, "the list")}, {}, f"{path.name}, a list of episodes")
