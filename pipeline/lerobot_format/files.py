@@ -133,6 +133,16 @@ def _read_text(folder: Path, relative: str) -> str:
         raise DatasetError(f"{path} cannot be read: {error}.") from None
 
 
+def stamp_of_file(path: Path) -> dict[str, Any]:
+    """What changes when a file that the user named does, found without reading it (JSON-able).
+
+    Raises:
+        OSError: it is not there.
+    """
+    stat = path.stat()
+    return {"path": str(path.resolve()), "bytes": stat.st_size, "modified_ns": stat.st_mtime_ns}
+
+
 def open_parquet(folder: Path, relative: str) -> "pq.ParquetFile":
     """A parquet file of the data set, its footer read and nothing else."""
     path = inside(folder, relative)

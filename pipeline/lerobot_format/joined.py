@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError, DatasetError
 from pipeline.lerobot_format.arrays import NotNumbers, as_numbers, batches, check_type
-from pipeline.lerobot_format.files import open_outside
+from pipeline.lerobot_format.files import open_outside, stamp_of_file
 from pipeline.lerobot_format.layout import INDEX_COLUMNS, MAX_WIDTH
 from pipeline.types import ACTION, STATE, Feature
 
@@ -31,13 +31,12 @@ def stamp_of_features(files: Mapping[str, Path]) -> dict[str, Any]:
     stamps = {}
     for name, path in files.items():
         try:
-            stat = path.stat()
+            stamps[name] = stamp_of_file(path)
         except OSError:
             raise DatasetError(
                 f"[datasets.‹name›.features] {name}: there is no file {path}. "
                 "The path is relative to the configuration file; correct it, or write the file."
             ) from None
-        stamps[name] = {"path": str(path.resolve()), "bytes": stat.st_size, "modified_ns": stat.st_mtime_ns}
     return stamps
 
 

@@ -15,6 +15,7 @@ from pipeline.errors import DatasetError
 from pipeline.experiment import Experiment
 from pipeline.lerobot_format.archives import is_archive, unpacked
 from pipeline.lerobot_format.columns import arrange, check_observation_set, names_after, set_units
+from pipeline.lerobot_format.files import stamp_of_file
 from pipeline.lerobot_format.frames import Frames, read_frames
 from pipeline.lerobot_format.joined import check_names, join_feature, stamp_of_features
 from pipeline.lerobot_format.layout import Layout, read_layout
@@ -297,9 +298,7 @@ def source_stamp(source: str, config_dir: Path) -> dict[str, Any]:
         }
     folder = _path(source, config_dir)
     if is_archive(folder):
-        stat = folder.stat()
-        path = str(folder.resolve())
-        return {"kind": "zip", "path": path, "bytes": stat.st_size, "modified_ns": stat.st_mtime_ns}
+        return {"kind": "zip", **stamp_of_file(folder)}
     if not folder.is_dir():
         read_layout(folder)  # its message says what is wrong
     digest, count, size = hashlib.sha256(), 0, 0
