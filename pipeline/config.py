@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 
 from pipeline.errors import ConfigError, did_you_mean
-from pipeline.methods import DERIVED, EXTERNAL, METHODS, SYMMETRIES, is_own
+from pipeline.methods import DERIVED, METHODS, SYMMETRIES, is_own
 from pipeline.settings import SETTINGS, settings_of
 from pipeline.types import ActionKind, ColumnChoice, Protocol
 
@@ -253,7 +253,7 @@ def parse_config(raw: dict[str, Any], where: str) -> Config:
     except ValidationError as error:
         raise ConfigError(f"{where}: {_first_problem(error)}") from None
     for name, policy in config.policies.items():
-        if policy.method not in METHODS or policy.method == EXTERNAL:
+        if policy.method not in METHODS:
             raise ConfigError(
                 f"{where}: [policies.{name}] method '{policy.method}' does not exist. {did_you_mean(policy.method, METHODS)} "
                 'A class of your own is named by its file or module: method = "my_policy.py:MyPolicy".'

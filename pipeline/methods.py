@@ -59,7 +59,10 @@ _OWN = re.compile(r"(?P<module>[^:]+):(?P<cls>[A-Za-z_]\w*)")
 
 
 class Methods(dict[str, Method]):
-    """This project's methods by name, and on asking for one by `where:Class` the adapter of a user's own."""
+    """This project's methods by name, and on asking for one by `where:Class` the adapter of a user's own.
+
+    `in` asks what can be trained and asked here; EXTERNAL is not, though a row of that method can be looked up.
+    """
 
     def __missing__(self, name: str) -> Method:
         if name == EXTERNAL:
@@ -69,7 +72,7 @@ class Methods(dict[str, Method]):
         raise KeyError(name)
 
     def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or name == EXTERNAL or (isinstance(name, str) and is_own(name))
+        return super().__contains__(name) or (isinstance(name, str) and is_own(name))
 
 
 def is_own(name: str) -> bool:
