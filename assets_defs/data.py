@@ -1,12 +1,14 @@
 """The first assets: demonstrations at a pinned revision, the split by episode, and the windows cut from it."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import dagster as dg
 
 from assets_defs.plan import Unit
-from assets_defs.resources import Budget, Outcome, Workbench, check_spec, code_version, result, warning_spec
+from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result, warning_spec
 from assets_defs.show import picture, present, table
 from pipeline.inspection.finding import CHECKS
 
@@ -41,39 +43,10 @@ def demonstrations(
     """
     bench = workbench.open(context, budget, look_at_source=True)
     asked = bench.plan.asked_of_source()
-
-    def read(draft):
-        from pipeline.config import hash_of
-        from pipeline.inspection.look import inspect
-        from pipeline.inspection.videos import local_folder
-        from pipeline.lerobot_format.quality import inspect_dataset
-        from pipeline.lerobot_format.read import load_experiment
-        from pipeline.lerobot_format.saved import save_demonstrations
-        from pipeline.sinks.pictures import picture_demonstration
-
-        demos, semantics = load_experiment(bench.experiment, workbench.config_dir)
-        save_demonstrations(demos, draft / "frames")
-        picture_demonstration(demos, semantics, draft / "trajectories.png")
-        stored = hash_again(draft / "frames")
-        units = bench.experiment.dataset.units  # what names say is in the content; what the user says is not
-        meaning = [semantics.kinds, {k: list(v) for k, v in semantics.circular.items()}, *([units] if units else [])]
-        shortest = int(demos.lengths.min())
-        found = inspect(demos, semantics, local_folder(bench.experiment.dataset.source, workbench.config_dir))
-        facts = inspect_dataset(demos, semantics) | found.as_json(bench.plan.key)
-        return Outcome(
-            {"asked": asked, "inspect": facts, "fingerprint": hash_of([stored, meaning])},
-            {
-                **{name: found.verdict(name) for name in CHECKS},
-                "stored_as_read": (stored == demos.content_hash, f"content hash {stored[:16]}"),
-                "counts": (
-                    shortest > 0 and int(demos.lengths.sum()) == demos.frames,
-                    f"{demos.episodes} episodes, {demos.frames:,} frames, the shortest {shortest}",
-                ),
-            },
-        )
-
     unit = Unit("demonstrations")
-    made = bench.make(unit, read, fingerprint=lambda outcome: outcome.summary["fingerprint"])
+    made = bench.make(
+        unit, lambda draft: _read(bench, asked, draft), fingerprint=lambda outcome: outcome.summary["fingerprint"]
+    )
     facts = made.summary["inspect"]
     metadata = {
         "episodes": facts["episodes"],
@@ -97,6 +70,38 @@ def demonstrations(
     }
     checks = ["stored_as_read", "counts"]
     return result(bench, key("demonstrations"), {"": made}, present(metadata), checks, warnings=tuple(CHECKS))
+
+
+def _read(bench: Bench, asked: Mapping[str, Any], draft: Path) -> Outcome:
+    """Read the source, look for what is wrong with it, and keep it; `asked` is what made the reading necessary."""
+    from pipeline.config import hash_of
+    from pipeline.inspection.look import inspect
+    from pipeline.inspection.videos import local_folder
+    from pipeline.lerobot_format.quality import inspect_dataset
+    from pipeline.lerobot_format.read import load_experiment
+    from pipeline.lerobot_format.saved import save_demonstrations
+    from pipeline.sinks.pictures import picture_demonstration
+
+    demos, semantics = load_experiment(bench.experiment, bench.workbench.config_dir)
+    save_demonstrations(demos, draft / "frames")
+    picture_demonstration(demos, semantics, draft / "trajectories.png")
+    stored = hash_again(draft / "frames")
+    units = bench.experiment.dataset.units  # what names say is in the content; what the user says is not
+    meaning = [semantics.kinds, {k: list(v) for k, v in semantics.circular.items()}, *([units] if units else [])]
+    shortest = int(demos.lengths.min())
+    found = inspect(demos, semantics, local_folder(bench.experiment.dataset.source, bench.workbench.config_dir))
+    facts = inspect_dataset(demos, semantics) | found.as_json(bench.plan.key)
+    return Outcome(
+        {"asked": asked, "inspect": facts, "fingerprint": hash_of([stored, meaning])},
+        {
+            **{name: found.verdict(name) for name in CHECKS},
+            "stored_as_read": (stored == demos.content_hash, f"content hash {stored[:16]}"),
+            "counts": (
+                shortest > 0 and int(demos.lengths.sum()) == demos.frames,
+                f"{demos.episodes} episodes, {demos.frames:,} frames, the shortest {shortest}",
+            ),
+        },
+    )
 
 
 def hash_again(folder: Path) -> str:
