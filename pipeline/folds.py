@@ -17,6 +17,7 @@ from pipeline.experiment import NO_BUDGET, Experiment, Variant
 from pipeline.lerobot_format.quality import dead_columns
 from pipeline.methods import METHODS
 from pipeline.split import make_split
+from pipeline.store import drafted_folder
 from pipeline.types import ACTION, Demonstrations, Fold, ObservationSet, Predictions, Semantics, Split
 from pipeline.windows import Windows, make_windows
 
@@ -169,9 +170,8 @@ def train_folds(
                 on_step=None if on_step is None else _counting_from(on_step, number, len(folds)),
                 recorded=recorded or unfinished / "steps.json",
             )
-            draft = kept.with_name(f".{kept.name}")
-            save_trained(trained, draft)
-            draft.rename(kept)
+            with drafted_folder(kept) as draft:
+                save_trained(trained, draft)
         shutil.copytree(kept, folder / kept.name)
         results.append(load_trained(kept))
     return results

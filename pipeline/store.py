@@ -172,13 +172,27 @@ def drafted(path: Path) -> Iterator[Path]:
 
     The one way to write a file whole or not at all.
     """
-    draft = path.with_name(f".{path.stem}.{os.getpid()}.draft{path.suffix}")
+    draft = path.parent / f".{path.stem}.{os.getpid()}.draft{path.suffix}"
     try:
         yield draft
         draft.replace(path)
     finally:
         with suppress(OSError):
             draft.unlink()
+
+
+@contextmanager
+def drafted_folder(folder: Path) -> Iterator[Path]:
+    """The same for a folder, which must not be there, or be empty; the block makes the temporary one."""
+    draft = folder.parent / f".{folder.name}.{os.getpid()}.draft"
+    shutil.rmtree(draft, ignore_errors=True)
+    try:
+        yield draft
+        if folder.exists():
+            folder.rmdir()
+        draft.rename(folder)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def write_json(path: Path, value: Any) -> None:

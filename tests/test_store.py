@@ -1,13 +1,14 @@
 """Results are there whole or not at all."""
 
 import os
+import shutil
 import time
 
 import psutil
 import pytest
 
 from pipeline.errors import ConfigError, StoreError
-from pipeline.store import Made, Meter, Store, drafted, write_json
+from pipeline.store import Made, Meter, Store, drafted, drafted_folder, write_json
 
 
 @pytest.fixture
@@ -83,6 +84,21 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path):
         write_json(path, float("nan"))
     assert path.read_text() == "one"
     assert [p.name for p in tmp_path.iterdir()] == ["page.html"], "no drafts left behind"
+
+
+def test_a_folder_is_written_whole_or_not_at_all(tmp_path):
+    folder = tmp_path / "tape"
+    folder.mkdir()
+    with drafted_folder(folder) as draft:
+        draft.mkdir()
+        (draft / "value.txt").write_text("one")
+    assert (folder / "value.txt").read_text() == "one"
+    with pytest.raises(FileNotFoundError), drafted_folder(tmp_path / "other") as draft:
+        shutil.copytree(folder, draft).joinpath("missing").rename(folder)
+    with pytest.raises(OSError, match="not empty"), drafted_folder(folder) as draft:
+        draft.mkdir()
+    assert [p.name for p in tmp_path.iterdir()] == ["tape"], "no drafts left behind"
+    assert (folder / "value.txt").read_text() == "one"
 
 
 def test_keys_cannot_walk_out(store):

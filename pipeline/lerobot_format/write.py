@@ -4,8 +4,6 @@ What belongs here: the v3.0 layout. Older layouts are only read; videos are not 
 """
 
 import json
-import os
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +13,7 @@ import numpy as np
 
 from pipeline.errors import StoreError
 from pipeline.lerobot_format.stats import column_stats
+from pipeline.store import drafted_folder
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -64,25 +63,19 @@ def write_dataset(
     _refuse_to_overwrite(folder)
     columns = _columns(features, episode_lengths, fps, tasks, timestamps)
     places = _places(columns, episode_lengths, episodes_per_file, files_per_chunk)
-    temporary = folder.parent / f".{folder.name}.{os.getpid()}.tmp"
     try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
-        _write_data(temporary, columns, places)
-        _write_episodes(temporary, columns, places, tasks)
-        _write_tasks(temporary, tasks)
-        _write_stats(temporary, columns)
-        info = _info(columns, places, fps, tasks, robot_type, files_per_chunk)
-        _write_json(temporary / "meta/info.json", info | dict(extra_info or {}))
-        if folder.exists():
-            folder.rmdir()
-        temporary.rename(folder)
+        with drafted_folder(folder) as draft:
+            draft.mkdir(parents=True)
+            _write_data(draft, columns, places)
+            _write_episodes(draft, columns, places, tasks)
+            _write_tasks(draft, tasks)
+            _write_stats(draft, columns)
+            info = _info(columns, places, fps, tasks, robot_type, files_per_chunk)
+            _write_json(draft / "meta/info.json", info | dict(extra_info or {}))
     except OSError as error:
         raise StoreError(
             f"{folder} cannot be written: {error.strerror or error}. Free some room, or choose another place."
         ) from None
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _refuse_to_overwrite(folder: Path) -> None:

@@ -7,7 +7,6 @@ Same seed, same demonstrations, whatever the number of processes: an attempt dep
 """
 
 import json
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass
@@ -20,6 +19,7 @@ import numpy as np
 
 from pipeline.errors import StoreError
 from pipeline.lerobot_format.write import FeatureArrays, write_dataset
+from pipeline.store import drafted_folder
 
 
 class Recorded(Protocol):
@@ -164,26 +164,20 @@ def _attempts(demonstrate: Callable[[int], Recorded | None], seed: int, workers:
 
 def _write(demonstrator: Demonstrator, out: Path, kept: list[Recorded], recording: Recording) -> None:
     """Data, card and `meta/recording.json` under a temporary name beside `out`, then renamed."""
-    draft = out.parent / f".{out.name}.recording"
-    shutil.rmtree(draft, ignore_errors=True)
     try:
-        write_dataset(
-            draft,
-            fps=demonstrator.fps,
-            features=demonstrator.features(kept),
-            episode_lengths=[len(demonstration.action) for demonstration in kept],
-            tasks=[demonstrator.task] * len(kept),
-            robot_type=demonstrator.robot_type,
-        )
-        (draft / "README.md").write_text(demonstrator.card(recording), encoding="utf-8")
-        (draft / "meta" / "recording.json").write_text(json.dumps(recording.as_dict(), indent=2) + "\n")
-        if out.exists():
-            out.rmdir()
-        draft.rename(out)
+        with drafted_folder(out) as draft:
+            write_dataset(
+                draft,
+                fps=demonstrator.fps,
+                features=demonstrator.features(kept),
+                episode_lengths=[len(demonstration.action) for demonstration in kept],
+                tasks=[demonstrator.task] * len(kept),
+                robot_type=demonstrator.robot_type,
+            )
+            (draft / "README.md").write_text(demonstrator.card(recording), encoding="utf-8")
+            (draft / "meta" / "recording.json").write_text(json.dumps(recording.as_dict(), indent=2) + "\n")
     except OSError as error:
         raise StoreError(f"{out} cannot be written: {error.strerror or error}. Choose another folder.") from None
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
 
 
 def last_of(lengths: Sequence[int]) -> np.ndarray:
