@@ -84,7 +84,4 @@ class Act(Samples, NetworkPolicy):
     """Acts with the latent's mean; `sample` draws the latent."""
 
     method = "act"
-
-    @classmethod
-    def build(cls, settings: ActSettings, shape: Shape) -> Net:
-        return _Act(settings, shape)
+    net = _Act

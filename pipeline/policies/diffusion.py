@@ -76,7 +76,4 @@ class Diffusion(Samples, NetworkPolicy):
     """Acts by one draw; `sample` draws."""
 
     method = "diffusion"
-
-    @classmethod
-    def build(cls, settings: DiffusionSettings, shape: Shape) -> Net:
-        return _Diffusion(settings, shape)
+    net = _Diffusion

@@ -52,7 +52,4 @@ class Flow(Samples, NetworkPolicy):
     """Acts by one draw (by none with `start_noise = 0`); `sample` draws."""
 
     method = "flow"
-
-    @classmethod
-    def build(cls, settings: FlowSettings, shape: Shape) -> Net:
-        return _Flow(settings, shape)
+    net = _Flow

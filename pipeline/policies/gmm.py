@@ -62,7 +62,4 @@ class Gmm(Samples, NetworkPolicy):
     """Acts by the mean of the heaviest component; `sample` draws from the mixture."""
 
     method = "gmm"
-
-    @classmethod
-    def build(cls, settings: GmmSettings, shape: Shape) -> Net:
-        return _Mixture(settings, shape)
+    net = _Mixture

@@ -63,10 +63,7 @@ class Image(NetworkPolicy):
     """Sees its observation set and a camera."""
 
     method = "image"
-
-    @classmethod
-    def build(cls, settings: ImageSettings, shape: Shape) -> Net:
-        return _FromCamera(settings, shape)
+    net = _FromCamera
 
     @classmethod
     def see(cls, settings: Any, transform: Transform, observations: Observations) -> np.ndarray:

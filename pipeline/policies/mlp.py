@@ -122,7 +122,4 @@ class MlpNetwork(NetworkPolicy):
     """Regression by a residual (or plain) perceptron with everything that networks can be given."""
 
     method = "mlp"
-
-    @classmethod
-    def build(cls, settings: MlpSettings, shape: Shape) -> Net:
-        return _Regression(settings, shape)
+    net = _Regression

@@ -3,7 +3,7 @@
 What belongs here: from windows to a module's inputs and back, rates, averages, samples' random numbers. What does not: any
 method's network or loss (each in its own file), the loop and its checkpoints (`fitting`), the view of the data (`transform`).
 
-A method is a subclass of `NetworkPolicy` that builds a `Net`. All seeds go on in step, each with batches, noise and dropout
+A method is a subclass of `NetworkPolicy` that names its `Net`. All seeds go on in step, each with batches, noise and dropout
 that depend on (seed, step) alone, so that a network does not depend on which others are trained beside it.
 """
 
@@ -78,9 +78,11 @@ class NetworkPolicy:
     """Fitted networks of one method, one a seed; answers as every policy does.
 
     method  its name in `methods.METHODS`, under which its settings' type is found
+    net     the class of its networks, each made with settings and a shape, weights from torch's own generator
     """
 
     method: ClassVar[str]
+    net: ClassVar[type[Net]]
 
     def __init__(
         self,
@@ -97,8 +99,8 @@ class NetworkPolicy:
 
     @classmethod
     def build(cls, settings: Any, shape: Shape) -> Net:
-        """A fresh network, its weights from torch's own generator."""
-        raise NotImplementedError
+        """A fresh network."""
+        return cls.net(settings, shape)
 
     @classmethod
     def see(cls, settings: Any, transform: Transform, observations: Observations) -> np.ndarray:
