@@ -128,15 +128,12 @@ def curves_asked(
 def _draw_curve(bench: Bench, unit: Unit, draft: Path) -> Outcome:
     """Train on every subset, keep the errors by size, and say what they mean."""
     from pipeline.curve import curve_sizes, full_size, train_subsets
-    from pipeline.folds import PolicyTask
     from pipeline.sinks import to_mlflow
     from pipeline.statistics.curve_reading import errors_file, keep_errors
     from pipeline.statistics.metrics import load_errors, save_errors
 
     policy, observations, _ = unit.entry.split("/")
-    sets = {s.name: s for s in bench.experiment.observation_sets}
-    variant = next(v for v in bench.plan.variants if v.name == policy)
-    task = PolicyTask(bench.demonstrations, bench.semantics, bench.split, sets[observations], variant, bench.experiment)
+    task = bench.task(next(v for v in bench.plan.variants if v.name == policy), observations)
     if task.steps is None:
         # CPU-seconds: every size gets as many steps as the full number of episodes got.
         task = task.with_steps(bench.summary(Unit(f"{policy}/trained_policy", observations))["steps"])

@@ -20,7 +20,7 @@ def looking_assets(deps: Sequence[dg.AssetKey]) -> list[dg.AssetsDefinition]:
 
 
 def _held_out(bench: Bench) -> list[int]:
-    return sorted(e for fold in bench.split.folds for e in fold.test)[:EPISODES]
+    return bench.split.held_out[:EPISODES]
 
 
 def _predictions(bench: Bench) -> list:

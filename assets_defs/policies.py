@@ -34,15 +34,6 @@ def policy_assets(variant: Variant) -> list[dg.AssetsDefinition]:
     return [trained, _predictions(variant, trained), _rollouts(variant, trained)]
 
 
-def _task(bench: Bench, variant: Variant, unit: Unit):
-    from pipeline.folds import PolicyTask
-
-    sets = {s.name: s for s in bench.experiment.observation_sets}
-    return PolicyTask(
-        bench.demonstrations, bench.semantics, bench.split, sets[unit.entry], variant, bench.experiment
-    )  # fmt: skip
-
-
 def _make_entries(
     bench: Bench, variant: Variant, kind: str, work: Callable[[Bench, Variant, Unit, Path], Outcome]
 ) -> dict[str, Made]:
@@ -117,7 +108,7 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
     from pipeline.sinks import to_mlflow
     from pipeline.sinks.pictures import picture_losses
 
-    task = _task(bench, variant, unit)
+    task = bench.task(variant, unit.entry)
     unfinished = bench.store.dataset(bench.plan.key) / ".unfinished" / bench.plan.fingerprint(unit)
     name = f"{variant.name} {unit.entry}"
     folds = train_folds(
@@ -211,7 +202,7 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
     from pipeline.sinks.pictures import picture_horizons
     from pipeline.statistics.metrics import save_errors, score_task
 
-    task = _task(bench, variant, unit)
+    task = bench.task(variant, unit.entry)
     trained_unit = Unit(f"{variant.name}/trained_policy", unit.entry)
     bench.progress(f"{variant.name} {unit.entry} predictions", 0, 1, "")
     predicted, facts = predict_folds(task, bench.plan.folder(trained_unit))
@@ -228,7 +219,7 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
         score.seed_metrics,
         artifacts=[draft / "error_by_horizon.png"],
     )
-    held_out = {e for fold in task.split.folds for e in fold.test}
+    held_out = set(task.split.held_out)
     scored = set(score.errors.episodes.tolist())
     return Outcome(
         {"metrics": score.metrics, "samples": samples, "split_hash": task.split.hash, **facts},
@@ -278,7 +269,7 @@ def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcom
     from pipeline.sinks import to_mlflow
     from pipeline.statistics.closed_loop import summarise_rollouts
 
-    task, trained_unit = _task(bench, variant, unit), Unit(f"{variant.name}/trained_policy", unit.entry)
+    task, trained_unit = bench.task(variant, unit.entry), Unit(f"{variant.name}/trained_policy", unit.entry)
     name = f"{variant.name} {unit.entry} roll-outs"
     try:
         results = roll_out(

@@ -144,6 +144,13 @@ class Bench:
 
         return load_split(self.plan.folder(Unit("episode_split")) / "split.json")
 
+    def task(self, variant: Variant, observations: str):
+        """One policy with one of the observation sets, on these folds."""
+        from pipeline.folds import PolicyTask
+
+        seen = next(s for s in self.experiment.observation_sets if s.name == observations)
+        return PolicyTask(self.demonstrations, self.semantics, self.split, seen, variant, self.experiment)
+
     def summary(self, unit: Unit) -> Mapping[str, Any]:
         """What a result says about itself."""
         made = self.store.made(self.plan.folder(unit))

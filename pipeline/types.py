@@ -173,6 +173,11 @@ class Split:
     seed: int
     hash: str
 
+    @property
+    def held_out(self) -> list[int]:
+        """The episodes (positions) that a fold holds out, ascending."""
+        return sorted(episode for fold in self.folds for episode in fold.test)
+
 
 @dataclass(frozen=True)
 class Observations:

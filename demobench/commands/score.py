@@ -250,7 +250,7 @@ def _episodes_to_ask(opened: Opened, trained_on: Path | None) -> list[int]:
     from pipeline.folds import split_of
 
     demos = opened.demos
-    held_out = sorted(e for fold in split_of(opened.target.experiment, demos).folds for e in fold.test)
+    held_out = split_of(opened.target.experiment, demos).held_out
     training = read_training(trained_on, demos)
     if training is None:
         return held_out
