@@ -25,6 +25,7 @@ app = typer.Typer(
 record_app = typer.Typer(help="Record demonstrations in simulation, by scripted demonstrators.", no_args_is_help=True)
 app.add_typer(record_app, name="record")
 
+DatasetArgument = Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")]
 ConfigOption = Annotated[
     Path | None,
     typer.Option("--config", help="Configuration; else DEMOBENCH_CONFIG, else ./demobench.toml, else built-in."),
@@ -34,6 +35,10 @@ JsonOption = Annotated[
     str | None,
     typer.Option("--json", metavar="FILE|-", help="Write the numbers as JSON to a file, or to standard output."),
 ]
+OutArgument = Annotated[Path, typer.Argument(help="The folder to write; it must not exist.")]
+EpisodesOption = Annotated[int, typer.Option(min=1, help="Demonstrations to record.")]
+SeedOption = Annotated[int, typer.Option(min=0, help="Same seed, same content.")]
+WorkersOption = Annotated[int, typer.Option(min=1, help="Processes.")]
 
 
 @app.callback()
@@ -90,7 +95,7 @@ def run(
 
 @app.command(epilog="Examples:\n\n    demobench inspect my/lerobot/folder\n\n    demobench inspect pusht_sim --json -")
 def inspect(
-    dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
+    dataset: DatasetArgument,
     config: ConfigOption = None,
     json_to: JsonOption = None,
 ) -> None:
@@ -105,7 +110,7 @@ def inspect(
     "    demobench floor pusht --radius 2 --probes 2000 --min-neighbours 5      the notebook's settings"
 )
 def floor(
-    dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
+    dataset: DatasetArgument,
     radius: Annotated[
         float | None,
         typer.Option(min=1e-12, help="The notebook's: frames within this distance are neighbours; else a close one."),
@@ -184,7 +189,7 @@ def compare(
     demobench curve pusht_sim --policy mlp_k01 --observations pose --sizes 20,40,80 --json -"""
 )
 def curve(
-    dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
+    dataset: DatasetArgument,
     policy: Annotated[
         str | None, typer.Option(help="The policy; else the data set's champion, else the first that is trained.")
     ] = None,
@@ -234,7 +239,7 @@ def curve(
     demobench split tape --format json --fold 0 --out fold0.json for score --trained-on"""
 )
 def split(
-    dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
+    dataset: DatasetArgument,
     form: Annotated[
         Literal["text", "json", "lerobot"],
         typer.Option(
@@ -267,7 +272,7 @@ def split(
     demobench score tape --remove my_act"""
 )
 def score(
-    dataset: Annotated[str, typer.Argument(help="A name from the file, a folder, or hub:owner/name.")],
+    dataset: DatasetArgument,
     predictions: Annotated[
         Path | None,
         typer.Argument(metavar="PREDICTIONS.parquet", help="Predictions made anywhere (docs/scoring.md)."),
@@ -355,7 +360,7 @@ def selftest(
     page: Annotated[
         Path | None, typer.Option(help="Write the report, a Markdown page with its plots beside it.")
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    workers: WorkersOption = 2,
     config: ConfigOption = None,
     store: StoreOption = None,
     json_to: JsonOption = None,
@@ -386,10 +391,10 @@ def ui(
 
 @record_app.command("pusht", epilog="Example:\n\n    demobench record pusht my_pusht --episodes 20 --seed 1")
 def record_pusht(
-    out: Annotated[Path, typer.Argument(help="The folder to write; it must not exist.")],
-    episodes: Annotated[int, typer.Option(min=1, help="Demonstrations to record.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same content.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    out: OutArgument,
+    episodes: EpisodesOption = 200,
+    seed: SeedOption = 0,
+    workers: WorkersOption = 2,
 ) -> None:
     """Record PushT demonstrations in simulation, by a planner with two strategies, as a LeRobot data set."""
     from demobench.commands.record import record_pusht
@@ -399,10 +404,10 @@ def record_pusht(
 
 @record_app.command("so101", epilog="Example:\n\n    demobench record so101 my_so101 --episodes 200 --seed 1")
 def record_so101(
-    out: Annotated[Path, typer.Argument(help="The folder to write; it must not exist.")],
-    episodes: Annotated[int, typer.Option(min=1, help="Demonstrations to record.")] = 50,
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same content.")] = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    out: OutArgument,
+    episodes: EpisodesOption = 50,
+    seed: SeedOption = 0,
+    workers: WorkersOption = 2,
 ) -> None:
     """Record SO-101 pick-and-place demonstrations in simulation, by a scripted leader, as a LeRobot data set."""
     from demobench.commands.record import record_so101
