@@ -1,9 +1,10 @@
 """`demobench run`: settings → plan → Dagster run → table."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -11,6 +12,11 @@ from demobench.commands.session import Session, open_session, program, short, wr
 from pipeline.errors import ConfigError, StoreError
 from pipeline.experiment import Choices, Target, parse_chunks, parse_list, resolve_target, select_rows
 from pipeline.methods import METHODS, is_own
+
+if TYPE_CHECKING:
+    from dagster import DagsterInstance, Definitions
+
+    from demobench.progress import RunProgress
 
 
 def run_benchmarks(
@@ -104,50 +110,59 @@ def materialise(
 
     from demobench.progress import RunProgress
 
-    with RunProgress(session.console, target, stale) as progress:
+    with RunProgress(session.console, target, stale) as progress, _dagster(target, session, progress) as dagster:
         from assets_defs.automation import BENCHMARK
-        from assets_defs.definitions import build_defs
-        from assets_defs.launch import Interrupts, close_dead_runs, open_instance, run_benchmark
+        from assets_defs.launch import run_benchmark
         from assets_defs.resources import asset_keys
 
-        with Interrupts() as interrupts, open_instance(session.store.root) as instance:
-
-            def report(*what: Any) -> None:
-                interrupts.check()
-                progress.report(*what)
-
-            defs = build_defs(
-                session.config,
-                config_dir=session.config_dir,
-                store=session.store,
-                progress=report,
-                experiments={target.key: target.experiment},
+        try:
+            run = run_benchmark(
+                *dagster,
+                target.key,
+                asset_keys(stale),
+                target.observations,
+                [v.name for v in target.selected],
+                progress.on_event,
+                job_name=job or BENCHMARK,
+                ops=ops,
             )
-            for run_id in close_dead_runs(instance):
-                progress.say(f"closed run {run_id[:8]}, whose process was gone")
-            try:
-                run = run_benchmark(
-                    instance,
-                    defs,
-                    target.key,
-                    asset_keys(stale),
-                    target.observations,
-                    [v.name for v in target.selected],
-                    progress.on_event,
-                    job_name=job or BENCHMARK,
-                    ops=ops,
-                )
-            except KeyboardInterrupt:
-                progress.stop()
-                session.console.print("Stopped. What was finished is kept; the same command goes on from there.")
-                raise typer.Exit(130) from None
-            except (OSError, SQLAlchemyError) as error:
-                raise StoreError(
-                    f"The run stopped because its log could not be written: {str(error).splitlines()[0]}. Results that were "
-                    f"finished are intact in {session.store.root}. Free some space there and run the same command again."
-                ) from error
+        except KeyboardInterrupt:
+            progress.stop()
+            session.console.print("Stopped. What was finished is kept; the same command goes on from there.")
+            raise typer.Exit(130) from None
+        except (OSError, SQLAlchemyError) as error:
+            raise StoreError(
+                f"The run stopped because its log could not be written: {str(error).splitlines()[0]}. Results that were "
+                f"finished are intact in {session.store.root}. Free some space there and run the same command again."
+            ) from error
     if not run.is_success:
         progress.raise_failure(run.run_id)
+
+
+@contextmanager
+def _dagster(
+    target: Target, session: Session, progress: "RunProgress"
+) -> "Iterator[tuple[DagsterInstance, Definitions]]":
+    """The store's Dagster instance, its dead runs closed, and the definitions, which Ctrl-C stops between two pieces of work."""
+    from assets_defs.definitions import build_defs
+    from assets_defs.launch import Interrupts, close_dead_runs, open_instance
+
+    with Interrupts() as interrupts, open_instance(session.store.root) as instance:
+
+        def report(*what: Any) -> None:
+            interrupts.check()
+            progress.report(*what)
+
+        defs = build_defs(
+            session.config,
+            config_dir=session.config_dir,
+            store=session.store,
+            progress=report,
+            experiments={target.key: target.experiment},
+        )
+        for run_id in close_dead_runs(instance):
+            progress.say(f"closed run {run_id[:8]}, whose process was gone")
+        yield instance, defs
 
 
 def collect(target: Target, plan: Any, session: Session) -> dict[str, Any]:
