@@ -72,6 +72,6 @@ def _why_no_predictions(episode: int, predictions: Sequence[Any], demos: Any, ta
             f"'{target.key}' has no up-to-date predictions in {session.store.root}; showing the recording alone.{known}"
         )
     anchors = np.concatenate([p.anchors for p in predictions])
-    held_out = demos.episode_ids[np.unique(np.searchsorted(demos.episode_starts, anchors, side="right") - 1)]
+    held_out = demos.episode_ids[np.unique(demos.episode_of_frame[anchors])]
     some = ", ".join(map(str, held_out[:10]))
     return f"Episode {episode} was trained on, so no policy was asked about it; held out are {some}{' …' * (len(held_out) > 10)}"

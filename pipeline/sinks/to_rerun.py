@@ -24,6 +24,7 @@ from pipeline.errors import StoreError
 from pipeline.normalize import wrap
 from pipeline.sinks import replacing
 from pipeline.sinks.palette import BASELINES, INK, MUTED, is_baseline, policy_colours
+from pipeline.sinks.words import common_unit
 from pipeline.types import ACTION, STATE, Demonstrations, Predictions, Semantics
 
 TIME, FRAME, EPISODE = "time", "frame", "episode_"
@@ -295,8 +296,7 @@ def _error_view(demos: Demonstrations, root: str, episode: int) -> Any:
     import rerun as rr
     import rerun.blueprint as rrb
 
-    units = set(demos.features[ACTION].units)
-    unit = next(iter(units)) if len(units) == 1 else "mixed units"
+    unit = common_unit(demos.features[ACTION].units)
     end_s = float(demos.timestamps[demos.episode(episode)].max())
     room = rr.TimeRange(
         start=rr.TimeRangeBoundary.absolute(seconds=0.0),
