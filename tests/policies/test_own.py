@@ -148,6 +148,8 @@ def test_a_changed_file_is_another_policy(write):
     assert METHODS["x.py:Y"].trained
     assert "x.py:Y" in METHODS
     assert "mlp2" not in METHODS
+    assert "external" not in METHODS, "predictions made elsewhere can be looked up, not trained"
+    assert METHODS["external"].trained
 
 
 def test_in_the_configuration(tmp_path):
