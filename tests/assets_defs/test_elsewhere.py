@@ -151,7 +151,7 @@ def test_mlflow_has_a_run_of_it_with_the_metrics_of_every_other_run(copied, scor
     }
     ours = copied.store.made(copied.plan().folder(Unit("mlp_k04/trained_policy", "state"))).summary["mlflow_run_id"]
     of_ours = client.get_run(ours).data.metrics
-    costs = {"train_s", "parameters"}
+    costs = {"train_s", "parameters", "steps"}
     assert set(run.data.metrics) == set(of_ours) - costs
     assert {name: run.data.metrics[name] for name in run.data.metrics} == pytest.approx(
         {name: of_ours[name] for name in run.data.metrics}
