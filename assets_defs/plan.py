@@ -8,7 +8,7 @@ What belongs here: which settings and inputs matter to which asset. What does no
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from pipeline.experiment import Experiment, Variant
 from pipeline.methods import METHODS, is_own
 from pipeline.settings import SETTINGS, settings_of
 from pipeline.store import Store
+from pipeline.types import AS_USUAL
 
 CODE_VERSIONS = {
     "demonstrations": "2",
@@ -28,7 +29,7 @@ CODE_VERSIONS = {
     "learning_curve": "1",
     "trained_policy": "1",
     "predictions": "2",
-    "rollouts": "1",
+    "rollouts": "2",
     "scored_predictions": "2",
     "benchmark_table": "4",
     "benchmark_report": "6",
@@ -266,7 +267,8 @@ class Plan:
             case "scored_predictions":
                 return _dump(e, {"protocol", "history"}) | {"asked": self._asked_of_scored(unit)}
             case "rollouts":
-                return {"simulator": _installed(e.dataset.simulator), "rollouts": e.rollouts}
+                variant = self._variant_named[unit.asset.split("/")[0]]
+                return {"simulator": _installed(e.dataset.simulator), "rollouts": e.rollouts} | _execution(variant, e)
             case "benchmark_table":
                 return {"name": e.name, "budget": e.budget_words, "champion": e.dataset.champion}
             case _:
@@ -315,6 +317,12 @@ def _given(variant: Variant, experiment: Experiment) -> dict[str, Any]:
         given |= {"features_source": source_hash(given["features"], "features")}
         given["features"] = given["features"].rpartition(":")[2]
     return {"derived" if key == "features" else key: value for key, value in given.items()}
+
+
+def _execution(variant: Variant, experiment: Experiment) -> dict[str, Any]:
+    """How its chunks are carried out, as far as it is not as usual."""
+    execution = experiment.policies[variant.family].execution
+    return {"execution": asdict(execution)} if execution != AS_USUAL else {}
 
 
 def _installed(simulator: str | None) -> dict[str, str | None] | None:

@@ -15,9 +15,10 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 
 from pipeline.errors import ConfigError, did_you_mean
+from pipeline.execution import settled
 from pipeline.methods import DERIVED, METHODS, SYMMETRIES, is_own
 from pipeline.settings import SETTINGS, settings_of
-from pipeline.types import ActionKind, ColumnChoice, Protocol
+from pipeline.types import AS_USUAL, ActionKind, ColumnChoice, Execution, Protocol
 
 BUDGETS = {"quick": 600, "standard": 3_000, "thorough": 20_000}
 """Training steps of each named budget."""
@@ -138,8 +139,24 @@ class PolicyConfig(Settings):
     steps: Annotated[int, Field(ge=1)] | None = None
     cpu_seconds: Annotated[float, Field(gt=0)] | None = None
     settings: dict[str, Any] = {}
+    execute: Annotated[int, Field(ge=1, le=10_000)] | None = None
+    ensemble: bool = False
+    delay: Annotated[int, Field(ge=0, le=10_000)] = 0
 
-    optional = frozenset({"history", "actions", "features", "augment", "steps", "cpu_seconds", "settings"})
+    optional = frozenset(
+        {
+            "history",
+            "actions",
+            "features",
+            "augment",
+            "steps",
+            "cpu_seconds",
+            "settings",
+            "execute",
+            "ensemble",
+            "delay",
+        }
+    )
 
     @property
     def given(self) -> dict[str, Any]:
@@ -148,6 +165,11 @@ class PolicyConfig(Settings):
         used |= {"actions": None if self.actions == "absolute" else self.actions}
         used |= {"noise": self.augment.noise or None, "symmetry": self.augment.symmetry}
         return {key: value for key, value in used.items() if value is not None}
+
+    @property
+    def execution(self) -> Execution:
+        """How its chunks are carried out in roll-outs; training does not depend on it."""
+        return Execution(self.execute, self.ensemble, self.delay)
 
     @property
     def view(self) -> dict[str, Any]:
@@ -276,9 +298,11 @@ def check_policy(policy: PolicyConfig) -> None:
     """Everything about a policy that can be said without data: its settings, and what its method can be given.
 
     Raises:
-        ConfigError: an unknown setting, something that the method does not take, two budgets.
+        ConfigError: an unknown setting, something that the method does not take, two budgets, chunks that cannot be carried
+            out as asked.
     """
     takes = METHODS[policy.method].takes
+    _check_execution(policy)
     for key in policy.given:
         if key not in takes:
             place = f"augment.{key}" if key in ("noise", "symmetry") else key
@@ -299,6 +323,15 @@ def check_policy(policy: PolicyConfig) -> None:
         settings_of(policy.method, policy.settings)
     elif policy.settings and not is_own(policy.method):
         raise ConfigError(f"has settings, and the method '{policy.method}' takes none. Remove them.")
+
+
+def _check_execution(policy: PolicyConfig) -> None:
+    if policy.execution == AS_USUAL:
+        return
+    if not METHODS[policy.method].trained:
+        raise ConfigError("execute, ensemble and delay are for policies that are rolled out, and baselines are not.")
+    for chunk in sorted(policy.chunks) or [1]:
+        settled(policy.execution, chunk)
 
 
 def _first_problem(error: ValidationError) -> str:

@@ -19,6 +19,7 @@ from pipeline.config import (
     ObservationConfig,
     PolicyConfig,
     Settings,
+    check_policy,
     check_slug,
     hash_of,
 )
@@ -362,6 +363,10 @@ def with_choices(base: Experiment, choices: Choices) -> Experiment:
         if extra and named and METHODS[policy.method].chunk == "set":
             chunks = tuple(sorted(set(policy.chunks) | extra))
             policies[family] = policy.model_copy(update={"chunks": chunks})
+            try:
+                check_policy(policies[family])
+            except ConfigError as error:
+                raise ConfigError(f"[policies.{family}] {error}") from None
     if policies != base.policies:
         updates["policies"] = policies
     return base.model_copy(update=updates)

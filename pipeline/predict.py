@@ -105,13 +105,30 @@ def latency_ms(policy: Any, windows: Windows, calls: int = 50) -> float:
     return float(np.median(times)) * 1e3
 
 
+MEMORY = 0.01
+"""m of a temporal ensemble: answers weigh exp(−m · i), i = 0 for the oldest."""
+
+
+def average_answers(answers: np.ndarray, circular: np.ndarray | None = None, m: float = MEMORY) -> np.ndarray:
+    """[n, ..., A] what n answers, oldest first, say of one frame → [..., A] float32, as `temporal_ensemble` averages them."""
+    weights = np.exp(-m * np.arange(len(answers)))
+    weights /= weights.sum()
+    plain = np.asarray(answers, np.float64)
+    mean = np.tensordot(weights, plain, axes=1)
+    if circular is not None and circular.any():
+        angles = plain[..., circular]
+        sine, cosine = (np.tensordot(weights, part, axes=1) for part in (np.sin(angles), np.cos(angles)))
+        mean[..., circular] = np.arctan2(sine, cosine)
+    return mean.astype(np.float32)
+
+
 def temporal_ensemble(
     actions: np.ndarray,
     anchors: np.ndarray,
     episode_starts: np.ndarray,
     *,
     circular: np.ndarray | None = None,
-    m: float = 0.01,
+    m: float = MEMORY,
 ) -> np.ndarray:
     """Average, at every anchor, all that was predicted for its frame there and before (ACT, Zhao et al. 2023).
 

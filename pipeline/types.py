@@ -304,6 +304,23 @@ class FloorEstimate:
 
 
 @dataclass(frozen=True)
+class Execution:
+    """How a policy's chunks are carried out (`pipeline.execution` says what goes together).
+
+    execute   actions carried out of each chunk before the policy is asked again; None: the usual 8, or as many as there are
+    ensemble  the policy is asked at every frame, and what all answers say of a frame is averaged
+    delay     frames from a question to its answer
+    """
+
+    execute: int | None = None
+    ensemble: bool = False
+    delay: int = 0
+
+
+AS_USUAL = Execution()
+
+
+@dataclass(frozen=True)
 class Rollouts:
     """Closed-loop results of one policy (seed 0 of fold 0) from numbered start states.
 
@@ -312,6 +329,7 @@ class Rollouts:
     paths         [R, L, 2] where the end effector went (NaN after the end), for pictures; None where not two-dimensional
     stages        [R, G] bool, which stages of the task each episode came to; None where the simulator has none
     stage_names   [G], earliest first
+    execution     how its chunks were carried out
     """
 
     simulator: str
@@ -326,6 +344,7 @@ class Rollouts:
     paths: np.ndarray | None
     stages: np.ndarray | None = None
     stage_names: tuple[str, ...] = ()
+    execution: Execution = AS_USUAL
 
     @property
     def stage_counts(self) -> list[int]:

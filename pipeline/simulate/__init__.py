@@ -41,6 +41,9 @@ class Environments(Protocol):
     def step(self, actions: np.ndarray, running: np.ndarray) -> Outcome:
         """Carry out actions [R, A] for one frame where `running` [R] is true; the others stand still and score 0."""
 
+    def standing(self) -> np.ndarray:
+        """The actions [R, A] that leave every robot where it is seen to be."""
+
     def effector(self) -> np.ndarray | None:
         """Where the end effector is [R, 2], for pictures; None where that is not two-dimensional."""
 

@@ -140,6 +140,9 @@ class PushTEnvironments:
             coverage[moving] = self._coverage([self._environments[i] for i in moving])
         return Outcome(reward_of(coverage), coverage, coverage > SUCCESS_COVERAGE)
 
+    def standing(self) -> np.ndarray:
+        return self.observe()[STATE]
+
     def effector(self) -> np.ndarray:
         return np.array([environment.agent.position for environment in self._environments])
 

@@ -3,13 +3,16 @@
 What belongs here: the loop between policy and simulator, for any simulator. What does not: physics, success intervals.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from pipeline.errors import PolicyError
+from pipeline.execution import settled
+from pipeline.predict import average_answers
 from pipeline.simulate import Environments, Simulator
-from pipeline.types import STATE, Observations, ObservationSet, Rollouts
+from pipeline.types import AS_USUAL, STATE, Execution, Observations, ObservationSet, Rollouts
 
 BATCH = 50
 """Environments that a policy is asked for together. Fixed: the size of a batch changes the last bits of a matrix
@@ -24,12 +27,13 @@ def rollout(
     *,
     name: str,
     history: int,
-    execute: int = 8,
+    execution: Execution = AS_USUAL,
+    circular: np.ndarray | None = None,
     max_steps: int | None = None,
     batch: int = BATCH,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Rollouts:
-    """Ask a policy, carry out the first `execute` actions of its chunk (all where the chunk is shorter), ask again.
+    """Ask a policy, carry out what `execution` says of its chunk, ask again (`pipeline.execution` says when what acts).
 
     An environment that has succeeded stops; the others go on until `max_steps` (default: the simulator's own limit).
     Its row stays in what the policy is asked, so every call has `batch` rows. Actions are clipped to the action
@@ -40,10 +44,12 @@ def rollout(
         start_states: numbers of start states (`Simulator.start`).
         name: of the policy, for the record.
         history: frames the policy is shown.
+        circular: [A] bool, action columns that an ensemble averages as directions.
         on_frame: called with (frames done, frames at most), over all batches.
 
     Raises:
         PolicyError: an answer has the wrong shape, or is not finite.
+        ConfigError: chunks as long as the policy's cannot be carried out like that.
     """
     limit = simulator.max_steps if max_steps is None else max_steps
     numbers = list(start_states)
@@ -54,11 +60,11 @@ def rollout(
         padded = block + [block[-1]] * (batch - len(block))
         episode = _Episode(simulator, observation_set, padded, history, name)
         episode.running[len(block) :] = False
-        for frame in episode.run(policy, execute, limit):
+        for frame in episode.run(policy, execution, circular, limit):
             if on_frame:
                 on_frame(len(parts) * limit + frame, total)
         parts.append({key: value[: len(block)] for key, value in episode.results().items()})
-        stage_names = episode.stage_names
+        stage_names, how = episode.stage_names, episode.execution
     return Rollouts(
         simulator=simulator.name,
         simulator_version=simulator.version(),
@@ -66,6 +72,7 @@ def rollout(
         observations=observation_set.name,
         start_states=np.asarray(numbers, dtype=np.int64),
         stage_names=stage_names,
+        execution=how,
         **_joined(parts),
     )
 
@@ -88,15 +95,32 @@ class _Episode:
         self._stages: dict[str, np.ndarray] = {}
         self._steps = np.zeros(rows, dtype=np.int64)
         self._path = [self._where(self.running)]
+        self._standing = self._environments.standing()
+        self._answers: deque[tuple[int, np.ndarray]] = deque()
+        self.execution = AS_USUAL
 
-    def run(self, policy, execute: int, limit: int) -> Iterator[int]:
-        """To the end of all environments; gives the frame after every answer that was carried out."""
+    def run(self, policy, execution: Execution, circular: np.ndarray | None, limit: int) -> Iterator[int]:
+        """To the end of all environments; gives the frame before every question but the first, and the last one."""
         while self.running.any() and self.frame < limit:
-            chunk = self.ask(policy)
-            for k in range(min(execute, chunk.shape[1], limit - self.frame)):
+            self._answers.append((self.frame, self.ask(policy)))
+            self.execution = settled(execution, self._answers[-1][1].shape[1])
+            for _ in range(min(self.execution.execute, limit - self.frame)):
                 if self.running.any():
-                    self.act(chunk[:, k])
+                    self.act(self.due(circular))
             yield self.frame
+
+    def due(self, circular: np.ndarray | None) -> np.ndarray:
+        """[R, A] the actions of this frame, from the answers that are there."""
+        while self._answers and self._answers[0][0] + self._answers[0][1].shape[1] <= self.frame:
+            self._answers.popleft()
+        there = [answer for asked, answer in self._said_of_now() if asked + self.execution.delay <= self.frame]
+        if not there:
+            return self._standing
+        return average_answers(np.stack(there), circular) if self.execution.ensemble else there[-1]
+
+    def _said_of_now(self) -> list[tuple[int, np.ndarray]]:
+        """When each answer was asked for, oldest first, and what it says of this frame [R, A]."""
+        return [(asked, chunk[:, self.frame - asked]) for asked, chunk in self._answers]
 
     def ask(self, policy) -> np.ndarray:
         """[R, K, A] the policy's chunk for every environment, finished ones included."""

@@ -171,6 +171,9 @@ class SO101Environments:
         by_name = dict(zip(STAGES, stages.T, strict=True))
         return Outcome(stages.mean(axis=1), np.full(len(stages), np.nan), by_name["placed"], by_name)
 
+    def standing(self) -> np.ndarray:
+        return self.observe()[STATE]
+
     def effector(self) -> None:
         """The arm moves in three dimensions."""
         return None

@@ -5,27 +5,37 @@ rates and their intervals (`statistics.success`).
 """
 
 import json
-from collections.abc import Callable
-from dataclasses import fields
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.errors import NotApplicableError
 from pipeline.folds import PolicyTask
+from pipeline.normalize import circular_columns
 from pipeline.simulate import simulator_for
 from pipeline.simulate.rollout import rollout
-from pipeline.types import Rollouts
+from pipeline.types import ACTION, Execution, Rollouts
 
 TEXTS = ("simulator", "simulator_version", "policy", "observations")
-STAGE_NAMES = "stage_names"
+STAGE_NAMES, EXECUTION = "stage_names", "execution"
 
 
-def roll_out(task: PolicyTask, trained: Path, on_frame: Callable[[int, int], None] | None = None) -> Rollouts:
-    """Seed 0 of fold 0, from the numbered start states 0 … n − 1.
+def roll_out(
+    task: PolicyTask,
+    trained: Path,
+    on_frame: Callable[[int, int], None] | None = None,
+    *,
+    start_states: Sequence[int] | None = None,
+    execution: Execution | None = None,
+) -> Rollouts:
+    """Seed 0 of fold 0, from the numbered start states 0 … n − 1 and as the policy's settings say, unless told otherwise.
 
     Raises:
         NotApplicableError: the data set has no simulator, or policies like this one cannot be asked in it.
+        PolicyError: the policy cannot be loaded, or its answers cannot be carried out.
+        ConfigError: its chunks cannot be carried out like that.
     """
     from pipeline.train import load_trained
 
@@ -41,9 +51,11 @@ def roll_out(task: PolicyTask, trained: Path, on_frame: Callable[[int, int], Non
         policy.one_seed(0),
         simulator,
         task.observation_set,
-        range(task.experiment.rollouts),
+        range(task.experiment.rollouts) if start_states is None else start_states,
         name=task.variant.name,
         history=task.windows(fold.test, fold).history,
+        execution=execution or task.policy.execution,
+        circular=circular_columns(task.demos, task.semantics, [ACTION]),
         on_frame=on_frame,
     )
 
@@ -52,10 +64,11 @@ def save_rollouts(rollouts: Rollouts, folder: Path) -> None:
     """Arrays as safetensors, words as JSON."""
     from safetensors.numpy import save_file
 
-    arrays = {f.name: getattr(rollouts, f.name) for f in fields(rollouts) if f.name not in (*TEXTS, STAGE_NAMES)}
+    words_of = (*TEXTS, STAGE_NAMES, EXECUTION)
+    arrays = {f.name: getattr(rollouts, f.name) for f in fields(rollouts) if f.name not in words_of}
     present = {name: np.ascontiguousarray(array) for name, array in arrays.items() if array is not None}
     save_file(present, folder / "rollouts.safetensors")
-    words = {name: getattr(rollouts, name) for name in TEXTS}
+    words = {name: getattr(rollouts, name) for name in TEXTS} | {EXECUTION: asdict(rollouts.execution)}
     words |= {STAGE_NAMES: rollouts.stage_names} if rollouts.stage_names else {}
     (folder / "rollouts.json").write_text(json.dumps(words))
 
@@ -66,4 +79,5 @@ def load_rollouts(folder: Path) -> Rollouts:
 
     arrays = load_file(folder / "rollouts.safetensors")
     words = json.loads((folder / "rollouts.json").read_text())
-    return Rollouts(**{"paths": None, **arrays, **words, STAGE_NAMES: tuple(words.get(STAGE_NAMES, ()))})
+    read = {STAGE_NAMES: tuple(words.get(STAGE_NAMES, ())), EXECUTION: Execution(**words.get(EXECUTION, {}))}
+    return Rollouts(**{"paths": None, **arrays, **words, **read})

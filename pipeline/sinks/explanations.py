@@ -11,6 +11,7 @@ from typing import Any
 from pipeline.sinks.findings import (
     NOT_HELD,
     capital,
+    driven_words,
     elsewhere_words,
     excluded_words,
     families_words,
@@ -75,7 +76,7 @@ def notes(table: Table) -> list[str]:
         )
     if not any(row["rollouts"] for row in table["policies"]):
         found.append("Closed loop: no simulator for this data set.")
-    found += [f"{capital(words)}." for words in elsewhere_words(table)]
+    found += [f"{capital(words)}." for words in (*driven_words(table), *elsewhere_words(table))]
     found += _tested(table)
     if not_held(table):
         found.append(f"{capital(NOT_HELD)}.")

@@ -5,10 +5,14 @@ tests. Nothing here calls one policy better than another unless a comparison of 
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
+from pipeline.execution import settled
+from pipeline.execution import words as execution_words
 from pipeline.methods import EXTERNAL, METHODS
 from pipeline.sinks.words import common_unit, decimals_for, is_number, plural, show, show_interval
+from pipeline.types import AS_USUAL, Execution
 
 Table = Mapping[str, Any]
 Row = Mapping[str, Any]
@@ -128,6 +132,16 @@ def elsewhere_words(table: Table) -> list[str]:
                 f"{row['policy']}: errors are of the mean of {row['samples']['count']} samples; at the first action "
                 f"{_samples_words(row['samples'], unit)}{f'; one second ahead {_samples_words(later, unit)}' if later else ''}"
             )
+    return found
+
+
+def driven_words(table: Table) -> list[str]:
+    """How chunks were carried out in closed loop, where that is not as usual."""
+    found = []
+    for row in (row for row in table["policies"] if row["rollouts"]):
+        how = row["rollouts"].get("execution")
+        if how and how != asdict(settled(AS_USUAL, row["chunk"] or 1)):
+            found.append(f"{name_in(table, address(row))} was rolled out with {execution_words(Execution(**how))}")
     return found
 
 

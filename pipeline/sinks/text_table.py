@@ -14,6 +14,7 @@ from pipeline.sinks.findings import (
     address,
     answer,
     champion,
+    driven_words,
     elsewhere_words,
     excluded_words,
     families_words,
@@ -271,6 +272,7 @@ def _footnotes(table: Mapping[str, Any]) -> list[str]:
     if any(row["rollouts"] for row in table["policies"]):
         trials = max(row["rollouts"]["n"] for row in table["policies"] if row["rollouts"])
         lines.append(f"success: {trials} start states, one network, Clopper–Pearson 95 % · score: mean best reward")
+    lines += driven_words(table)
     if any(first_step_gap(row) for row in table["policies"]):
         lines.append(
             "above floor: the first action's RMSE less the least that a policy of what it sees can have (gamma); "

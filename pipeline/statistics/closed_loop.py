@@ -3,6 +3,7 @@
 What belongs here: summaries of `Rollouts`. What does not: rolling out (`simulate`), tests between success rates (`success`).
 """
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ def summarise_rollouts(rollouts: Rollouts) -> dict[str, Any]:
         "success_interval": list(clopper_pearson(successes, n)),
         "score": float(rollouts.best_reward.mean()),
         "median_steps": float(np.median(rollouts.steps)),
+        "execution": asdict(rollouts.execution),
     }
     if not np.isnan(rollouts.best_coverage).any():
         summary["best_coverage"] = float(rollouts.best_coverage.mean())

@@ -60,6 +60,12 @@ def test_what_matters_to_its_weights_makes_it_stale_and_nothing_else(made, chang
     assert stale(made, with_net(**changes)) == {"net_k04/trained_policy"}
 
 
+@pytest.mark.parametrize("changes", [{"execute": 2}, {"ensemble": True}, {"delay": 1, "execute": 1}], ids=str)
+def test_how_chunks_are_carried_out_makes_only_roll_outs_stale(made, changes):
+    changed = TinyBenchmark(made.folder, made.store, with_net(**changes))
+    assert {unit.asset for unit in changed.plan().stale() if "/" in unit.asset} == {"net_k04/rollouts"}
+
+
 def test_a_file_of_derived_features_is_watched(made, tmp_path):
     prints = [made.plan().fingerprint(TRAINED)]
     for factor in (1, 2):

@@ -5,11 +5,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from pipeline.errors import PolicyError
+from pipeline.errors import ConfigError, PolicyError
+from pipeline.predict import average_answers, temporal_ensemble
 from pipeline.simulate import Outcome
 from pipeline.simulate.pusht import BLOCK, PushT, environment_class
 from pipeline.simulate.rollout import BATCH, rollout
-from pipeline.types import STATE, Observations, ObservationSet
+from pipeline.types import STATE, Execution, Observations, ObservationSet
 
 SET = ObservationSet("state", (STATE,))
 
@@ -44,6 +45,9 @@ class _Points:
         self.at[running] = actions[running]
         done = np.where(running, self.at[:, 0], 0.0)
         return Outcome(np.clip(done, 0, 1), done, done >= 1)
+
+    def standing(self):
+        return self.at.astype(np.float32)
 
     def effector(self):
         return np.repeat(self.at, 2, axis=1) if self.draws else None
@@ -84,7 +88,7 @@ def test_paths_hold_every_place_and_nothing_after_the_end():
 
 def test_history_begins_with_the_first_frame_repeated():
     policy = Creeper(step=0.01)
-    rollout(policy, Line(), SET, [7], name="creeper", history=3, execute=1, max_steps=4)
+    rollout(policy, Line(), SET, [7], name="creeper", history=3, execution=Execution(1), max_steps=4)
     seen = [asked.values[0, :, 0] for asked in policy.asked]
     expected = [[0.07, 0.07, 0.07], [0.07, 0.07, 0.08], [0.07, 0.08, 0.09], [0.08, 0.09, 0.10]]
     np.testing.assert_allclose(seen, expected, atol=1e-6)
@@ -93,12 +97,93 @@ def test_history_begins_with_the_first_frame_repeated():
     assert all(asked.anchors is None and asked.state.shape == (BATCH, 3, 1) for asked in policy.asked)
 
 
-@pytest.mark.parametrize(("chunk", "execute", "asked"), [(16, 8, 3), (4, 8, 5), (1, 8, 20), (16, 2, 10), (16, 30, 2)])
+@pytest.mark.parametrize(
+    ("chunk", "execute", "asked"), [(16, None, 3), (4, None, 5), (1, None, 20), (16, 2, 10), (16, 16, 2)]
+)
 def test_a_chunk_is_carried_out_as_far_as_asked(chunk, execute, asked):
     policy = Creeper(step=0.001, chunk=chunk)
-    results = rollout(policy, Line(), SET, [0], name="creeper", history=1, execute=execute)
+    results = rollout(policy, Line(), SET, [0], name="creeper", history=1, execution=Execution(execute))
     assert len(policy.asked) == asked
     assert results.steps.tolist() == [20]
+    assert results.execution == Execution(execute or min(8, chunk))
+
+
+class Restless:
+    """Answers anything, different for every place, and always the same there; remembers what it said."""
+
+    def __init__(self, chunk: int):
+        self.ahead, self.said = np.arange(chunk, dtype=np.float32), []
+
+    def predict(self, observations: Observations) -> np.ndarray:
+        at = observations.values[:, -1, :1]
+        answer = 0.9 * np.sin(97 * at + 3 * self.ahead)[None, :, :, None]
+        self.said.append(answer[0])
+        return answer
+
+
+def by_hand(execution: Execution, chunk: int, at: float, frames: int) -> list[float]:
+    """The places of one environment, from a loop that keeps every answer and looks through all of them in every frame."""
+    policy, answers, path = Restless(chunk), {}, [np.float32(at)]
+    for frame in range(frames):
+        if execution.ensemble or frame % execution.execute == 0:
+            shown = np.array([[[path[-1]]]], dtype=np.float32)
+            answers[frame] = policy.predict(Observations(shown, shown, np.zeros((1, 1))))[0, 0, :, 0]
+        there = [asked for asked in answers if asked + execution.delay <= frame < asked + chunk]
+        if not there:
+            action = path[0]
+        elif execution.ensemble:
+            weights = [np.exp(-0.01 * older) for older in range(len(there))]
+            said = [float(answers[asked][frame - asked]) for asked in there]
+            action = sum(w * a for w, a in zip(weights, said, strict=True)) / sum(weights)
+        else:
+            action = answers[there[-1]][frame - there[-1]]
+        path.append(np.float32(action))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("chunk", "execution"),
+    [
+        (8, Execution(3)), (8, Execution(8)), (1, Execution(1)), (8, Execution(4, delay=2)), (8, Execution(4, delay=4)),
+        (9, Execution(5, delay=1)), (6, Execution(1, ensemble=True)), (6, Execution(1, ensemble=True, delay=1)),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_every_way_of_carrying_chunks_out_equals_a_slow_loop(chunk, execution):
+    starts = [-90, -3, 0, 42]
+    results = rollout(Restless(chunk), Line(), SET, starts, name="r", history=1, execution=execution, batch=4)
+    expected = [by_hand(execution, chunk, start / 100, 20) for start in starts]
+    np.testing.assert_allclose(results.paths[:, :, 0], expected, atol=1e-6)
+    assert len(np.unique(results.paths[:, :, 0])) > 30
+    assert results.execution == execution
+
+
+def test_an_ensemble_is_the_one_that_is_measured_offline():
+    policy = Restless(5)
+    results = rollout(policy, Line(), SET, [7], name="r", history=1, execution=Execution(ensemble=True), batch=1)
+    said = np.stack(policy.said, axis=1)
+    offline = temporal_ensemble(said, np.arange(20), np.array([0, 20]))
+    np.testing.assert_allclose(results.paths[0, 1:, 0], offline[0, :, 0], atol=1e-6)
+
+
+def test_angles_are_averaged_as_directions():
+    answers = np.array([[[3.1]], [[-3.1]]])
+    assert abs(average_answers(answers, np.array([True]))[0, 0]) > 3.1
+    assert abs(average_answers(answers)[0, 0]) < 0.1
+    offline = temporal_ensemble(
+        np.array([[[[0.0], [3.1]], [[-3.1], [0.0]]]]), np.arange(2), np.array([0, 2]), circular=np.array([True])
+    )
+    assert average_answers(answers, np.array([True]))[0, 0] == pytest.approx(offline[0, 1, 0])
+
+
+def test_the_robot_stands_still_until_the_first_answer_is_there():
+    results = rollout(Creeper(), Line(), SET, [30], name="c", history=1, execution=Execution(8, delay=3), batch=1)
+    np.testing.assert_allclose(results.paths[0, :6, 0], [0.3, 0.3, 0.3, 0.3, 0.7, 0.8], atol=1e-6)
+
+
+def test_a_chunk_that_cannot_be_carried_out_like_that_is_refused():
+    with pytest.raises(ConfigError, match="execute = 9 needs a chunk of at least 9 actions, and this one has 4"):
+        rollout(Creeper(chunk=4), Line(), SET, [0], name="c", history=1, execution=Execution(9))
 
 
 def test_every_question_has_the_same_number_of_rows():

@@ -23,7 +23,7 @@ from pipeline.simulate.so101 import (
 )
 from pipeline.simulate.so101_arm import NAMES, UNITS, to_columns
 from pipeline.simulate.so101_world import APART_M, CUBE_M, RADIUS_M, model, start_of
-from pipeline.types import ACTION, STATE, Demonstrations, Feature, Observations, ObservationSet
+from pipeline.types import ACTION, STATE, Demonstrations, Execution, Feature, Observations, ObservationSet
 
 SEEN = ObservationSet("pose", (STATE, POSE))
 
@@ -179,7 +179,7 @@ def ways() -> dict[int, np.ndarray]:
 
 def test_the_scripted_leader_replayed_succeeds(ways):
     policy = Player(list(ways.values()))
-    results = rollout(policy, SO101(), SEEN, list(ways), name="leader", history=1, execute=10, batch=4)
+    results = rollout(policy, SO101(), SEEN, list(ways), name="leader", history=1, execution=Execution(10), batch=4)
     assert results.success.all()
     assert results.best_reward.tolist() == [1.0] * 4
     assert np.isnan(results.best_coverage).all()
@@ -235,7 +235,7 @@ class Still:
 
 
 def test_standing_still_never_succeeds():
-    results = rollout(Still(), SO101(), SEEN, range(3), name="hold_still", history=1, execute=50, batch=3)
+    results = rollout(Still(), SO101(), SEEN, range(3), name="hold_still", history=1, execution=Execution(50), batch=3)
     assert results.success.sum() == 0
     assert results.steps.tolist() == [MAX_STEPS] * 3
     assert results.best_reward.max() == 0

@@ -7,6 +7,7 @@ from pipeline.sinks.findings import (
     ahead,
     answer,
     champion,
+    driven_words,
     family,
     gap_parts,
     gap_words,
@@ -40,6 +41,14 @@ def test_where_a_task_has_stages_they_are_counted(table, success):
     stages = {"stages": ["reached", "grasped", "placed"], "stage_counts": [48, 17, round(50 * success)]}
     next(row for row in table["policies"] if row["rollouts"])["rollouts"] |= {"success": success} | stages
     assert said(table)[-1].endswith(f". Of 50 episodes: reached 48, grasped 17, placed {round(50 * success)}.")
+
+
+def test_how_chunks_were_carried_out_is_said_where_it_is_not_as_usual(table):
+    rolled = next(row for row in table["policies"] if row["rollouts"])["rollouts"]
+    rolled["execution"] = {"execute": 4, "ensemble": False, "delay": 0}
+    assert driven_words(table) == []
+    rolled["execution"] = {"execute": 2, "ensemble": False, "delay": 1}
+    assert driven_words(table) == ["mlp_k04 was rolled out with 2 actions of each chunk, 1 frame late"]
 
 
 def test_nothing_is_called_better_without_a_test(table):

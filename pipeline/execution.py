@@ -1,0 +1,61 @@
+"""How a policy's chunks are carried out: what can be asked for, and whether it goes together with a chunk.
+
+What belongs here: checks and words. What does not: doing it (`simulate.rollout`).
+
+A policy is asked at frame 0 and after every `execute` frames. Its answer is there `delay` frames later and holds the actions of
+the frame it was asked at and of those after it, so the first `delay` of them are over; until it is there the one before goes on.
+Before the first answer is there the robot stands still.
+"""
+
+from dataclasses import replace
+
+from pipeline.errors import ConfigError
+from pipeline.types import Execution
+
+USUAL = 8
+"""Actions carried out of each chunk where nothing is said, or all that a shorter chunk has."""
+
+
+def settled(execution: Execution, chunk: int) -> Execution:
+    """The same with `execute` known, for a policy that answers `chunk` actions.
+
+    Raises:
+        ConfigError: its parts contradict each other, or the chunk.
+    """
+    execute, delay = execution.execute, execution.delay
+    if execution.ensemble and execute not in (None, 1):
+        raise ConfigError(
+            f"execute = {execute} and ensemble contradict each other: a temporal ensemble asks at every frame. Keep one of them."
+        )
+    if execution.ensemble:
+        execute = 1
+    if delay >= chunk:
+        raise ConfigError(
+            f"delay = {delay}, and a chunk of {_actions(chunk)} is over before its first action can begin. "
+            f"Use a chunk of at least {delay + max(execute or 1, delay)}."
+        )
+    if execute is None:
+        execute = min(USUAL, chunk - delay)
+    if execute + delay > chunk:
+        after = f" after a delay of {delay}" if delay else ""
+        raise ConfigError(
+            f"execute = {execute}{after} needs a chunk of at least {execute + delay} actions, and this one has {chunk}. "
+            f"Use a longer chunk, or execute at most {chunk - delay}."
+        )
+    if delay > execute:
+        raise ConfigError(
+            f"delay = {delay} is longer than the {execute} frames between two questions: the policy would be asked while it "
+            f"still thinks. Execute at least {delay} actions of a chunk of at least {2 * delay}."
+        )
+    return replace(execution, execute=execute)
+
+
+def words(execution: Execution) -> str:
+    """As people read it: `8 actions of each chunk`, `a temporal ensemble`, with the delay where there is one."""
+    how = "a temporal ensemble" if execution.ensemble else f"{_actions(execution.execute or USUAL)} of each chunk"
+    late = f", {execution.delay} frame{'s' * (execution.delay != 1)} late" if execution.delay else ""
+    return how + late
+
+
+def _actions(count: int) -> str:
+    return f"{count} action{'s' * (count != 1)}"
