@@ -84,7 +84,7 @@ def _write_table(bench: Bench, draft) -> Outcome:
                 **bench.summary(unit),
                 "parameters": trained["parameters"],
                 **{name: trained.get(name) for name in ("train_s", "steps", "cpu_s", "vram_mb")},
-                "rollouts": bench.summary(rolled).get("rollouts") if plan.is_fresh(rolled) else None,
+                **_rolled_out(bench, rolled),
             }
         )
     entries += [_entry_from_elsewhere(bench, unit) for unit in plan.scored_units() if plan.is_fresh(unit)]
@@ -115,6 +115,14 @@ def _write_table(bench: Bench, draft) -> Outcome:
             "same_data": (hashes == {bench.split.hash}, f"split {bench.split.hash[:16]}"),
         },
     )
+
+
+def _rolled_out(bench: Bench, unit: Unit) -> dict:
+    """What came of a policy's roll-outs, and why there are none where there could be."""
+    said = bench.summary(unit) if bench.plan.is_fresh(unit) else {}
+    variant = next(v for v in bench.plan.variants if v.name == unit.policy)
+    could = bench.experiment.dataset.simulator is not None and variant.is_trained
+    return {"rollouts": said.get("rollouts"), "no_rollouts": said.get("why_not") if could else None}
 
 
 def _entry_from_elsewhere(bench: Bench, unit: Unit) -> dict:

@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import hash_of
+from pipeline.config import SafetyConfig, hash_of
 from pipeline.experiment import Experiment, Variant
 from pipeline.methods import METHODS, is_own
 from pipeline.settings import SETTINGS, settings_of
@@ -31,7 +31,7 @@ CODE_VERSIONS = {
     "predictions": "2",
     "rollouts": "2",
     "scored_predictions": "2",
-    "benchmark_table": "4",
+    "benchmark_table": "5",
     "benchmark_report": "6",
     "mcap_log": "1",
     "rerun_recording": "1",
@@ -268,7 +268,10 @@ class Plan:
                 return _dump(e, {"protocol", "history"}) | {"asked": self._asked_of_scored(unit)}
             case "rollouts":
                 variant = self._variant_named[unit.asset.split("/")[0]]
-                return {"simulator": _installed(e.dataset.simulator), "rollouts": e.rollouts} | _execution(variant, e)
+                settings = {"simulator": _installed(e.dataset.simulator), "rollouts": e.rollouts} | _execution(
+                    variant, e
+                )
+                return settings | ({"safety": e.dataset.safety} if e.dataset.safety != SafetyConfig() else {})
             case "benchmark_table":
                 return {"name": e.name, "budget": e.budget_words, "champion": e.dataset.champion}
             case _:

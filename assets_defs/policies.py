@@ -264,7 +264,7 @@ def _rollouts(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDefini
 
 
 def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
-    from pipeline.errors import NotApplicableError
+    from pipeline.errors import ConfigError, NotApplicableError, PolicyError
     from pipeline.simulate.trial import roll_out, save_rollouts
     from pipeline.sinks import to_mlflow
     from pipeline.statistics.closed_loop import summarise_rollouts
@@ -277,7 +277,8 @@ def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcom
             bench.plan.folder(trained_unit),
             lambda done, total: bench.progress(name, done, total, "frames"),
         )
-    except NotApplicableError as why:
+    except (NotApplicableError, PolicyError, ConfigError) as why:
+        # One policy that cannot be rolled out must not keep the others from the table, which says why this one was not.
         return Outcome({"rollouts": None, "why_not": str(why)}, {"sane": (True, str(why))})
     save_rollouts(results, draft)
     summary = summarise_rollouts(results)

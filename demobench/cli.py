@@ -234,6 +234,39 @@ def curve(
 
 @app.command(
     epilog="""Examples:\n
+    demobench rollouts pusht_sim/mlp_k16/pose                               once more, from other start states\n
+    demobench rollouts pusht_sim/mlp/pose --execute 1,4,8 --delay 0,2       every chunk, executed actions and delay\n
+    demobench rollouts so101_sim/mlp_k16/pose --execute 8 --ensemble --starts 200 --from 1000 --json -"""
+)
+def rollouts(
+    address: Annotated[
+        str, typer.Argument(metavar="POLICY", help="dataset/policy[/observations]; mlp stands for all of its chunks.")
+    ],
+    execute: Annotated[
+        str | None, typer.Option(help="Actions carried out of each chunk: 1,4,8; else as the configuration says.")
+    ] = None,
+    delay: Annotated[str | None, typer.Option(help="Frames from a question to its answer: 0,2")] = None,
+    ensemble: Annotated[bool, typer.Option("--ensemble", help="Also (or only) as a temporal ensemble.")] = False,
+    starts: Annotated[int, typer.Option(min=1, help="Start states.")] = 100,
+    first: Annotated[
+        int | None,
+        typer.Option("--from", min=0, help="The first start state's number; else those that follow the benchmark's."),
+    ] = None,
+    config: ConfigOption = None,
+    store: StoreOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Trained policies in the simulator: success for each chunk, number of executed actions, and delay. Nothing is trained."""
+    from demobench.commands.rollouts import run_rollouts
+
+    run_rollouts(
+        address, execute=execute, delay=delay, ensemble=ensemble, starts=starts, first=first, config_path=config,
+        store_path=store, json_to=json_to,
+    )  # fmt: skip
+
+
+@app.command(
+    epilog="""Examples:\n
     demobench split tape                                         which episodes every fold holds out\n
     demobench split tape --format lerobot --fold 0               what LeRobot's trainer takes\n
     demobench split tape --format json --fold 0 --out fold0.json for score --trained-on"""

@@ -90,6 +90,44 @@ class ObservationConfig(Settings):
     history: Annotated[int, Field(ge=1, le=1000)] | None = None
 
 
+Number = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class WorkspaceConfig(Settings):
+    """A box for the effector, m."""
+
+    low: tuple[Number, Number, Number]
+    high: tuple[Number, Number, Number]
+
+
+class SafetyConfig(Settings):
+    """Limits of the safety layer beside the simulator's own, by action column or unit.
+
+    low, high   of each column       per_frame  the most that it may change in a frame
+    stop_after  interventions in so many frames in a row end an episode
+    """
+
+    low: dict[str, Number] = {}
+    high: dict[str, Number] = {}
+    per_frame: dict[str, Annotated[Number, Field(gt=0)]] = {}
+    workspace: WorkspaceConfig | None = None
+    stop_after: Annotated[int, Field(ge=1)] | None = None
+
+    @model_validator(mode="after")
+    def _limits_can_be_kept(self):
+        for word in self.low.keys() & self.high.keys():
+            if self.low[word] > self.high[word]:
+                raise ConfigError(
+                    f"safety: the limits of '{word}' contradict each other: nothing is both {self.low[word]:g} or more and "
+                    f"{self.high[word]:g} or less."
+                )
+        if self.workspace and not all(a < b for a, b in zip(self.workspace.low, self.workspace.high, strict=True)):
+            raise ConfigError(
+                "safety: the limits of the workspace contradict each other: low must be below high everywhere."
+            )
+        return self
+
+
 class DatasetConfig(Settings):
     source: str
     simulator: Literal["pusht", "so101"] | None = None
@@ -104,8 +142,9 @@ class DatasetConfig(Settings):
     units: str | dict[str, str] | None = None
     features: dict[str, str] = {}
     exclude: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    safety: SafetyConfig = SafetyConfig()
 
-    optional = frozenset({"state", "action", "units", "features", "exclude"})
+    optional = frozenset({"state", "action", "units", "features", "exclude", "safety"})
 
     def choice(self, config_dir: Path) -> ColumnChoice:
         """Which columns and episodes are used; the files of joined features are relative to `config_dir`."""
@@ -354,6 +393,8 @@ def _keys_at(path: list[str]) -> list[str]:
     model = blocks.get(path[0], Config) if path else Config
     if path[:1] == ["policies"] and path[2:] == ["augment"]:
         model = AugmentConfig
+    if path[:1] == ["datasets"] and path[2:] == ["safety"]:
+        model = SafetyConfig
     return list(model.model_fields)
 
 

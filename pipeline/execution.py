@@ -44,7 +44,7 @@ def settled(execution: Execution, chunk: int) -> Execution:
         )
     if delay > execute:
         raise ConfigError(
-            f"delay = {delay} is longer than the {execute} frames between two questions: the policy would be asked while it "
+            f"delay = {delay} is longer than the {_frames(execute)} between two questions: the policy would be asked while it "
             f"still thinks. Execute at least {delay} actions of a chunk of at least {2 * delay}."
         )
     return replace(execution, execute=execute)
@@ -53,9 +53,13 @@ def settled(execution: Execution, chunk: int) -> Execution:
 def words(execution: Execution) -> str:
     """As people read it: `8 actions of each chunk`, `a temporal ensemble`, with the delay where there is one."""
     how = "a temporal ensemble" if execution.ensemble else f"{_actions(execution.execute or USUAL)} of each chunk"
-    late = f", {execution.delay} frame{'s' * (execution.delay != 1)} late" if execution.delay else ""
+    late = f", {_frames(execution.delay)} late" if execution.delay else ""
     return how + late
 
 
 def _actions(count: int) -> str:
     return f"{count} action{'s' * (count != 1)}"
+
+
+def _frames(count: int) -> str:
+    return f"{count} frame{'s' * (count != 1)}"

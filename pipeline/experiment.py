@@ -406,20 +406,21 @@ def parse_list(text: str | None) -> tuple[str, ...]:
 
 def parse_chunks(text: str | None) -> tuple[int, ...]:
     """`"1,16"` → `(1, 16)`; a ConfigError where something is not a whole number of at least 1."""
-    return _parse_numbers("--chunks", text, 1)
+    return parse_numbers("--chunks", text, 1)
 
 
 def parse_horizons(text: str | None) -> tuple[int, ...]:
     """`"0,30"` → `(0, 30)`; a ConfigError where something is not a whole number of at least 0."""
-    return _parse_numbers("--horizons", text, 0)
+    return parse_numbers("--horizons", text, 0)
 
 
 def parse_sizes(text: str | None) -> tuple[int, ...]:
     """`"10,20"` → `(10, 20)`; a ConfigError where something is not a whole number of at least 1."""
-    return _parse_numbers("--sizes", text, 1)
+    return parse_numbers("--sizes", text, 1)
 
 
-def _parse_numbers(option: str, text: str | None, least: int) -> tuple[int, ...]:
+def parse_numbers(option: str, text: str | None, least: int) -> tuple[int, ...]:
+    """What an option with a list of whole numbers of at least `least` says; a ConfigError where it says something else."""
     try:
         numbers = tuple(int(part) for part in parse_list(text))
     except ValueError:

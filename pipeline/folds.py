@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.config import PolicyConfig
+from pipeline.errors import PolicyError
 from pipeline.experiment import NO_BUDGET, Experiment, Variant
 from pipeline.lerobot_format.quality import dead_columns
-from pipeline.methods import METHODS
+from pipeline.methods import METHODS, is_own
 from pipeline.split import make_split
 from pipeline.store import drafted_folder
 from pipeline.types import ACTION, Demonstrations, Fold, ObservationSet, Predictions, Semantics, Split
@@ -171,10 +172,40 @@ def train_folds(
                 recorded=recorded or unfinished / "steps.json",
             )
             with drafted_folder(kept) as draft:
-                save_trained(trained, draft)
+                save_trained(trained, draft, _data_of(task))
         shutil.copytree(kept, folder / kept.name)
         results.append(load_trained(kept))
     return results
+
+
+def _data_of(task: PolicyTask) -> dict[str, Any]:
+    """What weights are of, kept beside them."""
+    return {"data_set": task.demos.name, "content_hash": task.demos.content_hash, "split_hash": task.split.hash}
+
+
+def load_fold(task: PolicyTask, trained: Path, number: int) -> Any:
+    """The policy that was trained on one fold, from the folder that `train_folds` wrote to.
+
+    Raises:
+        PolicyError: it cannot be read, or is of another method, chunk or data set than the task.
+    """
+    from pipeline.train import load_trained
+
+    folder, variant = trained / f"fold_{number}", task.variant
+    found = load_trained(folder)
+    data, own = found.trained_on.get("content_hash"), is_own(variant.method)
+    differ = [
+        ("method", found.method, variant.method, not own),
+        ("chunk", found.policy.chunk, variant.chunk, variant.is_trained),
+        ("data set (content hash)", str(data)[:12], task.demos.content_hash[:12], data is not None),
+    ]
+    for what, theirs, ours, matters in differ:
+        if matters and theirs != ours:
+            raise PolicyError(
+                f"The weights in {folder} are not those of {variant.name} on '{task.demos.name}': their {what} is {theirs}, "
+                f"expected {ours}. Somebody replaced them; remove {trained} and run the benchmark again."
+            )
+    return found.policy
 
 
 def _counting_from(
@@ -189,12 +220,11 @@ def predict_folds(task: PolicyTask, trained: Path) -> tuple[Predictions, dict[st
     Also returns `latency_ms` of one call, and `windows_train` and `windows_test`, summed over folds.
     """
     from pipeline.predict import join_folds, latency_ms
-    from pipeline.train import load_trained
 
     parts = []
     facts = {"latency_ms": 0.0, "windows_train": 0, "windows_test": 0}
     for number, fold in enumerate(task.split.folds):
-        policy = load_trained(trained / f"fold_{number}").policy
+        policy = load_fold(task, trained, number)
         held_out = task.windows(fold.test, fold)
         parts.append(predict_fold(task, policy, number, held_out))
         facts["windows_train"] += len(task.windows(fold.train, fold))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.errors import NotApplicableError
+from pipeline.errors import NotApplicableError, PolicyError
 from pipeline.lerobot_format.kinds import wrap
 from pipeline.lerobot_format.quality import dead_columns
 from pipeline.types import ACTION, STATE, Demonstrations, Protocol, Semantics
@@ -92,6 +92,19 @@ class Normalizer:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> "Normalizer":
         return cls(Scaler.from_arrays(arrays, "observations"), Scaler.from_arrays(arrays, "actions"))
+
+
+def check_columns(values: np.ndarray, expected: int) -> None:
+    """Observations [..., O] must be those that something was fitted on.
+
+    Raises:
+        PolicyError: another number of columns.
+    """
+    if values.shape[-1] != expected:
+        raise PolicyError(
+            f"The policy sees {expected} columns and was given {values.shape[-1]}: it was trained on another data set or "
+            "observation set."
+        )
 
 
 def unroll(values: np.ndarray, circular: np.ndarray) -> np.ndarray:

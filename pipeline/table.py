@@ -233,6 +233,7 @@ def _row(entry: Mapping[str, Any], experiment: Experiment, facts: Mapping[str, A
         },
         "above_floor": [],
         "rollouts": entry["rollouts"],
+        "no_rollouts": entry.get("no_rollouts"),
         "samples": entry.get("samples"),
         "by_task": errors_by_task(entry["errors"], facts["episode_tasks"], experiment.protocol),
         **entry.get("elsewhere", {}),

@@ -11,7 +11,7 @@ method learns (`policies`), or where folders lie (`store`).
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ class Trained:
     steps_logged  [L]     losses [S, L], each the mean since the entry before; both empty for policies that do not train
     train_s       seconds of training, all seeds together; cpu_s of all processor cores
     vram_mb       the most memory of a GPU that was in use, 0 without one
+    trained_on    what its data were, where that was kept
     """
 
     method: str
@@ -43,6 +44,7 @@ class Trained:
     parameters: int
     cpu_s: float = 0.0
     vram_mb: float = 0.0
+    trained_on: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def steps(self) -> int:
@@ -94,14 +96,14 @@ def train_policy(
     return Trained(method, policy, curve.steps, curve.losses, *costs)
 
 
-def save_trained(trained: Trained, folder: Path) -> None:
-    """Write a trained policy into a folder, which is made if it is not there."""
+def save_trained(trained: Trained, folder: Path, trained_on: Mapping[str, Any] | None = None) -> None:
+    """Write a trained policy into a folder, which is made if it is not there; `trained_on` says what its data were."""
     from safetensors.numpy import save_file
 
     folder.mkdir(parents=True, exist_ok=True)
     arrays = {name: np.ascontiguousarray(array) for name, array in trained.policy.arrays().items()}
     save_file(arrays, folder / WEIGHTS)
-    settings = {"method": trained.method, "settings": trained.policy.settings()}
+    settings = {"method": trained.method, "settings": trained.policy.settings(), "trained_on": dict(trained_on or {})}
     (folder / POLICY).write_text(json.dumps(settings, indent=1))
     training = {
         "steps": trained.steps_logged.tolist(),
@@ -131,7 +133,13 @@ def load_trained(folder: Path) -> Trained:
         losses = np.array(training["losses"], np.float32)
         steps = np.array(training["steps"], np.int64)
         costs = (training["train_s"], training["parameters"], training.get("cpu_s", 0.0), training.get("vram_mb", 0.0))
-        return Trained(described["method"], policy, steps, losses, *costs)
+        return Trained(described["method"], policy, steps, losses, *costs, described.get("trained_on", {}))
+    except RuntimeError as error:
+        # PyTorch's words for weights that do not fit a network; the first line says of which class.
+        raise PolicyError(
+            f"The weights in {folder} are of another architecture than {POLICY} beside them says "
+            f"({str(error).splitlines()[0].rstrip(':')}). Train it again."
+        ) from None
     except (OSError, SafetensorError, ValueError, KeyError) as error:
         raise PolicyError(
             f"The trained policy in {folder} cannot be read ({type(error).__name__}: {error}). Train it again."

@@ -330,6 +330,8 @@ class Rollouts:
     stages        [R, G] bool, which stages of the task each episode came to; None where the simulator has none
     stage_names   [G], earliest first
     execution     how its chunks were carried out
+    interventions [R] frames in which the safety layer passed something else on than was asked for
+    stopped       [R] why it stopped the robot (`safety.RUNS`: it did not)
     """
 
     simulator: str
@@ -345,6 +347,8 @@ class Rollouts:
     stages: np.ndarray | None = None
     stage_names: tuple[str, ...] = ()
     execution: Execution = AS_USUAL
+    interventions: np.ndarray | None = None
+    stopped: np.ndarray | None = None
 
     @property
     def stage_counts(self) -> list[int]:

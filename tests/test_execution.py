@@ -35,7 +35,7 @@ def test_what_is_not_said_is_as_usual_or_what_the_chunk_has(chunk, asked, execut
         (8, Execution(7, delay=2), "execute = 7 after a delay of 2 needs a chunk of at least 9 actions"),
         (16, Execution(2, delay=3), "delay = 3 is longer than the 2 frames between two questions"),
         (6, Execution(delay=4), "delay = 4 is longer than the 2 frames"),
-        (8, Execution(ensemble=True, delay=2), "delay = 2 is longer than the 1 frames"),
+        (8, Execution(ensemble=True, delay=2), "delay = 2 is longer than the 1 frame between"),
     ],
 )
 def test_what_contradicts_is_refused(chunk, asked, message):

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from pipeline.errors import PolicyError
-from pipeline.normalize import Normalizer
+from pipeline.normalize import Normalizer, check_columns
 from pipeline.policies import Curve, Plan
 from pipeline.policies.batched import Stack
 from pipeline.policies.body import perceptron
@@ -58,6 +58,7 @@ class PlainMlp:
         batch, frames = observations.values.shape[:2]
         if frames != self.history:
             raise PolicyError(f"The policy sees {self.history} frames at a time and was given {frames}.")
+        check_columns(observations.values, len(self.normalizer.observations.circular))
         encoded = self.normalizer.observations.encode(observations.values).reshape(batch, -1)
         with torch.inference_mode():
             inputs = torch.from_numpy(encoded).expand(len(self.seeds), -1, -1)
@@ -78,6 +79,12 @@ class PlainMlp:
     @classmethod
     def restore(cls, arrays: Mapping[str, np.ndarray], settings: Mapping[str, Any]) -> Any:
         stack, normalizer = Stack.restore(arrays), Normalizer.from_arrays(arrays)
+        widths = (settings["history"] * normalizer.observations.width, settings["chunk"] * normalizer.actions.width)
+        found = (stack.weights[0].shape[1], stack.weights[-1].shape[2])
+        if found != widths:
+            raise ValueError(
+                f"a network of {found[0]} inputs and {found[1]} outputs, expected {widths[0]} and {widths[1]}"
+            )
         return cls(stack, normalizer, tuple(settings["seeds"]), settings["history"], settings["chunk"])
 
 

@@ -23,7 +23,7 @@ from pipeline.errors import ConfigError, PolicyError, did_you_mean
 from pipeline.lerobot_format.kinds import wrap
 from pipeline.lerobot_format.quality import dead_columns
 from pipeline.methods import DERIVED, SYMMETRIES
-from pipeline.normalize import Normalizer, Scaler, circular_columns, fit_scaler, frames_of
+from pipeline.normalize import Normalizer, Scaler, check_columns, circular_columns, fit_scaler, frames_of
 from pipeline.types import ACTION, STATE
 from pipeline.windows import Windows
 
@@ -89,6 +89,7 @@ class Transform:
         """
         if values.shape[1] != self.history:
             raise PolicyError(f"The policy sees {self.history} frames at a time and was given {values.shape[1]}.")
+        check_columns(values, len(self.observations.circular))
         columns = self.observations.encode(values).reshape(len(values), -1)
         if self.derived is None:
             return columns

@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from pipeline.errors import NotApplicableError, did_you_mean
+from pipeline.safety import Limits
 from pipeline.types import Demonstrations, ObservationSet
 
 
@@ -52,13 +53,13 @@ class Simulator(Protocol):
     """A world that policies can be rolled out in.
 
     name          as in `demobench.toml`          max_steps  frames an episode may take
-    action_low, action_high  [A] bounds of the action space; actions beyond them are clipped
     """
 
     name: str
     max_steps: int
-    action_low: np.ndarray
-    action_high: np.ndarray
+
+    def limits(self) -> Limits:
+        """What its robot may be told; the safety layer of every roll-out keeps them."""
 
     def version(self) -> str:
         """Name and version of everything that the physics depends on."""

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.errors import NotApplicableError
+from pipeline.safety import Limits
 from pipeline.simulate import Outcome
 from pipeline.simulate.columns import misfit, misnumbered
 from pipeline.types import ACTION, STATE, Demonstrations, ObservationSet
@@ -157,14 +158,16 @@ class PushT:
 
     name = "pusht"
     max_steps = MAX_STEPS
-    action_low = np.zeros(2)
-    action_high = np.full(2, TABLE_PX)
 
     def __init__(self):
         environment_class()
 
     def version(self) -> str:
         return ", ".join(f"{name} {version}" for name, version in versions().items())
+
+    def limits(self) -> Limits:
+        """The table. The finger follows its target as fast as its own control lets it."""
+        return Limits(COLUMNS[STATE], np.zeros(2), np.full(2, TABLE_PX), np.full(2, np.inf))
 
     def start(self, numbers: Sequence[int]) -> PushTEnvironments:
         return PushTEnvironments(numbers)

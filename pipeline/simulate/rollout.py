@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.errors import PolicyError
 from pipeline.execution import settled
 from pipeline.predict import average_answers
+from pipeline.safety import NOT_FINITE, RUNS, Guard, Limits
 from pipeline.simulate import Environments, Simulator
 from pipeline.types import AS_USUAL, STATE, Execution, Observations, ObservationSet, Rollouts
 
@@ -29,6 +30,7 @@ def rollout(
     history: int,
     execution: Execution = AS_USUAL,
     circular: np.ndarray | None = None,
+    limits: Limits | None = None,
     max_steps: int | None = None,
     batch: int = BATCH,
     on_frame: Callable[[int, int], None] | None = None,
@@ -36,8 +38,9 @@ def rollout(
     """Ask a policy, carry out what `execution` says of its chunk, ask again (`pipeline.execution` says when what acts).
 
     An environment that has succeeded stops; the others go on until `max_steps` (default: the simulator's own limit).
-    Its row stays in what the policy is asked, so every call has `batch` rows. Actions are clipped to the action
-    space. History before the first frame repeats the first frame, as in the windows a policy is trained on.
+    Its row stays in what the policy is asked, so every call has `batch` rows. The safety layer stands between the
+    policy and every robot; where it stops one, the episode is over. History before the first frame repeats the first
+    frame, as in the windows a policy is trained on.
 
     Args:
         policy: `predict(Observations) -> [S, B, K, A]`; the first seed acts.
@@ -45,11 +48,12 @@ def rollout(
         name: of the policy, for the record.
         history: frames the policy is shown.
         circular: [A] bool, action columns that an ensemble averages as directions.
+        limits: of the safety layer; the simulator's own if none are given.
         on_frame: called with (frames done, frames at most), over all batches.
 
     Raises:
-        PolicyError: an answer has the wrong shape, or is not finite.
-        ConfigError: chunks as long as the policy's cannot be carried out like that.
+        PolicyError: an answer has the wrong shape, or the first one of every episode is not finite.
+        ConfigError: chunks as long as the policy's cannot be carried out like that, or limits cannot be kept from the start.
     """
     limit = simulator.max_steps if max_steps is None else max_steps
     numbers = list(start_states)
@@ -58,13 +62,15 @@ def rollout(
     for first in range(0, len(numbers), batch):
         block = numbers[first : first + batch]
         padded = block + [block[-1]] * (batch - len(block))
-        episode = _Episode(simulator, observation_set, padded, history, name)
+        episode = _Episode(simulator, observation_set, padded, history, name, limits or simulator.limits())
         episode.running[len(block) :] = False
         for frame in episode.run(policy, execution, circular, limit):
             if on_frame:
                 on_frame(len(parts) * limit + frame, total)
         parts.append({key: value[: len(block)] for key, value in episode.results().items()})
         stage_names, how = episode.stage_names, episode.execution
+    results = _joined(parts)
+    _require_answers(results, name)
     return Rollouts(
         simulator=simulator.name,
         simulator_version=simulator.version(),
@@ -73,7 +79,7 @@ def rollout(
         start_states=np.asarray(numbers, dtype=np.int64),
         stage_names=stage_names,
         execution=how,
-        **_joined(parts),
+        **results,
     )
 
 
@@ -81,11 +87,19 @@ class _Episode:
     """`batch` environments from their start states to their ends, and what is remembered of them."""
 
     def __init__(
-        self, simulator: Simulator, observation_set: ObservationSet, numbers: list[int], history: int, name: str
+        self,
+        simulator: Simulator,
+        observation_set: ObservationSet,
+        numbers: list[int],
+        history: int,
+        name: str,
+        limits: Limits,
     ):
-        self._simulator, self._features, self._name = simulator, observation_set.features, name
+        self._features, self._name = observation_set.features, name
         self._environments: Environments = simulator.start(numbers)
-        rows, columns = len(numbers), len(simulator.action_low)
+        rows, columns = len(numbers), len(limits.names)
+        self._standing = self._environments.standing()
+        self._guard = Guard(limits, self._standing)
         self._seen = [self._environments.observe()] * history
         self._previous = np.full((rows, columns), np.nan, dtype=np.float32)
         self.running = np.ones(rows, dtype=bool)
@@ -95,7 +109,6 @@ class _Episode:
         self._stages: dict[str, np.ndarray] = {}
         self._steps = np.zeros(rows, dtype=np.int64)
         self._path = [self._where(self.running)]
-        self._standing = self._environments.standing()
         self._answers: deque[tuple[int, np.ndarray]] = deque()
         self.execution = AS_USUAL
 
@@ -134,20 +147,15 @@ class _Episode:
                 f"Policy '{self._name}' answered with shape {answer.shape} in a roll-out; expected "
                 f"[seeds, {rows}, chunk, {columns}]."
             )
-        if not np.isfinite(answer[0][self.running]).all():
-            raise PolicyError(
-                f"Policy '{self._name}' answered with NaN or infinite actions in a roll-out, at step {self.frame}. "
-                "Its training has probably diverged: look at its loss."
-            )
         return answer[0]
 
     def act(self, actions: np.ndarray) -> None:
-        """One frame in every environment that still runs; actions [R, A]."""
-        clipped = np.clip(actions, self._simulator.action_low, self._simulator.action_high).astype(np.float32)
-        ran = self.running.copy()
-        outcome = self._environments.step(clipped, ran)
+        """One frame in every environment that still runs and is not stopped now; actions [R, A]."""
+        safe = self._guard(actions, self.running)
+        ran = self.running & (self._guard.stopped == RUNS)
+        outcome = self._environments.step(safe, ran)
         self.frame += 1
-        self._previous[ran] = clipped[ran]
+        self._previous[ran] = safe[ran]
         self._seen = [*self._seen[1:], self._environments.observe()]
         self._best_reward = np.where(ran, np.maximum(self._best_reward, outcome.reward), self._best_reward)
         self._best_coverage = np.where(ran, np.maximum(self._best_coverage, outcome.coverage), self._best_coverage)
@@ -169,6 +177,8 @@ class _Episode:
             "best_reward": self._best_reward,
             "best_coverage": self._best_coverage,
             "steps": self._steps,
+            "interventions": self._guard.interventions,
+            "stopped": self._guard.stopped,
             "paths": np.stack(self._path, axis=1),
         }
 
@@ -178,6 +188,15 @@ class _Episode:
         if place is None:
             return np.zeros((len(moved), 0), dtype=np.float32)
         return np.where(moved[:, None], place, np.nan).astype(np.float32)
+
+
+def _require_answers(results: dict[str, np.ndarray | None], name: str) -> None:
+    """A policy that cannot be asked at all has no success rate."""
+    if ((results["stopped"] == NOT_FINITE) & (results["steps"] == 0)).all():
+        raise PolicyError(
+            f"Policy '{name}' answered with NaN or infinite actions in a roll-out, at the first step of every episode. "
+            "Its training has probably diverged: look at its loss."
+        )
 
 
 def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray | None]:

@@ -9,15 +9,16 @@ that ship with the project start from numbers of 2³² and above (`recording`).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.errors import NotApplicableError
+from pipeline.safety import Limits, Workspace
 from pipeline.simulate import Outcome
 from pipeline.simulate.columns import misfit, misnumbered
-from pipeline.simulate.so101_arm import HIGH_RAD, LOW_RAD, NAMES, UNITS, to_angles, to_columns
+from pipeline.simulate.so101_arm import HIGH_RAD, LOW_RAD, NAMES, UNITS, InverseKinematics, to_angles, to_columns
 from pipeline.simulate.so101_world import CUBE_M, DRAWS_SENSORS, SUBSTEPS, Start, arm_file, model, start_of, versions
 from pipeline.types import ACTION, STATE, Demonstrations, ObservationSet
 
@@ -48,6 +49,10 @@ ENCODER_DEG = 360 / 4096
 """A joint's encoder: white noise of this standard deviation, then whole steps of 1/4096 turn."""
 POSE_STEP = 1e-4
 """The cube's and target's place is reported in whole 0.1 mm."""
+FASTEST_PER_FRAME = 10.0
+"""The most that an action may change in a frame, ° (300 °/s) or %; the scripted leader needs half of it."""
+WORKSPACE_LOW_M, WORKSPACE_HIGH_M = (0.0, -0.3, 0.0), (0.45, 0.3, 0.35)
+"""Where the fixed jaw's tip may be told to be: ahead of the arm's base, and not below the table."""
 FASTEST = 1e3
 """m/s or rad/s; whatever is faster has left the physics."""
 
@@ -185,6 +190,7 @@ class SO101:
     name = "so101"
     max_steps = MAX_STEPS
     action_low, action_high = to_columns(LOW_RAD), to_columns(HIGH_RAD)
+    """[6] limits of the joints."""
 
     def __init__(self):
         arm_file()
@@ -192,11 +198,24 @@ class SO101:
     def version(self) -> str:
         return ", ".join(f"{name} {version}" for name, version in versions().items())
 
+    def limits(self) -> Limits:
+        """The joints', as their encoders report them; a speed that the servos do not have; a box around the table in reach."""
+        low, high = as_encoders_report(LOW_RAD), as_encoders_report(HIGH_RAD)
+        low, high = np.minimum(low, self.action_low), np.maximum(high, self.action_high)
+        workspace = Workspace(np.array(WORKSPACE_LOW_M), np.array(WORKSPACE_HIGH_M), _fingertips())
+        return Limits(NAMES, low, high, np.full(6, FASTEST_PER_FRAME), workspace)
+
     def start(self, numbers: Sequence[int]) -> SO101Environments:
         return SO101Environments(numbers)
 
     def fits(self, demos: Demonstrations, observation_set: ObservationSet) -> str | None:
         return misfit(demos, observation_set, "the SO-101 simulator", COLUMNS, lambda key: _problem(demos, key))
+
+
+def _fingertips() -> Callable[[np.ndarray], np.ndarray]:
+    """Forward kinematics: columns [n, 6] → the tip of the fixed jaw [n, 3], m."""
+    arm, tip = InverseKinematics(model()), np.zeros(3)
+    return lambda columns: np.array([arm.forward(angles, tip)[0] for angles in to_angles(columns)])
 
 
 def _problem(demos: Demonstrations, key: str) -> str | None:

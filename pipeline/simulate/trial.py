@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.errors import NotApplicableError
-from pipeline.folds import PolicyTask
+from pipeline.folds import PolicyTask, load_fold
 from pipeline.normalize import circular_columns
+from pipeline.safety import tighter
 from pipeline.simulate import simulator_for
 from pipeline.simulate.rollout import rollout
 from pipeline.types import ACTION, Execution, Rollouts
@@ -37,15 +38,13 @@ def roll_out(
         PolicyError: the policy cannot be loaded, or its answers cannot be carried out.
         ConfigError: its chunks cannot be carried out like that.
     """
-    from pipeline.train import load_trained
-
     name = task.experiment.dataset.simulator
     if name is None:
         raise NotApplicableError("no simulator for this data set")
     if not task.variant.is_trained:
         raise NotApplicableError("baselines are not rolled out")
     simulator = simulator_for(name, task.demos, task.observation_set)
-    policy = load_trained(trained / "fold_0").policy
+    policy = load_fold(task, trained, 0)
     fold = task.split.folds[0]
     return rollout(
         policy.one_seed(0),
@@ -55,6 +54,7 @@ def roll_out(
         name=task.variant.name,
         history=task.windows(fold.test, fold).history,
         execution=execution or task.policy.execution,
+        limits=tighter(simulator.limits(), task.experiment.dataset.safety, task.demos.features[ACTION]),
         circular=circular_columns(task.demos, task.semantics, [ACTION]),
         on_frame=on_frame,
     )

@@ -136,13 +136,35 @@ def elsewhere_words(table: Table) -> list[str]:
 
 
 def driven_words(table: Table) -> list[str]:
-    """How chunks were carried out in closed loop, where that is not as usual."""
+    """What closed-loop results rest on: how chunks were carried out where that is not as usual, what the safety layer did,
+    and why there are none."""
     found = []
     for row in (row for row in table["policies"] if row["rollouts"]):
         how = row["rollouts"].get("execution")
         if how and how != asdict(settled(AS_USUAL, row["chunk"] or 1)):
             found.append(f"{name_in(table, address(row))} was rolled out with {execution_words(Execution(**how))}")
-    return found
+    reasons: dict[str, list[str]] = {}
+    for row in table["policies"]:
+        if why := row.get("no_rollouts"):
+            reasons.setdefault(why, []).append(name_in(table, address(row)))
+    found += _safety_words(table)
+    return found + [f"no roll-outs of {', '.join(names)}: {why}" for why, names in reasons.items()]
+
+
+def _safety_words(table: Table) -> list[str]:
+    """How often the safety layer stepped in, policy by policy; nothing where it did not have to."""
+    rows = [row for row in table["policies"] if (row["rollouts"] or {}).get("interventions")]
+    if not rows:
+        return []
+    words = [f"{name_in(table, address(row))} {_stepped_in(row['rollouts'])}" for row in rows]
+    return [f"the safety layer stepped in (share of the frames): {', '.join(words)}"]
+
+
+def _stepped_in(rollouts: Mapping[str, Any]) -> str:
+    share, stopped, broken = (rollouts[name] for name in ("intervened", "stopped", "stopped_not_finite"))
+    why = f", {broken} for actions that are not finite" if broken else ""
+    small = f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
+    return f"{small} ({stopped} of {rollouts['n']} episodes stopped{why})" if stopped else small
 
 
 def _samples_words(scores: Mapping[str, Any], unit: str) -> str:

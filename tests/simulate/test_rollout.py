@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.errors import ConfigError, PolicyError
 from pipeline.predict import average_answers, temporal_ensemble
+from pipeline.safety import NOT_FINITE, REPEATED, RUNS, Limits
 from pipeline.simulate import Outcome
 from pipeline.simulate.pusht import BLOCK, PushT, environment_class
 from pipeline.simulate.rollout import BATCH, rollout
@@ -19,13 +20,15 @@ class Line:
     """A point on a line that starts at its number / 100 and moves to where it is told; it succeeds from 1 on."""
 
     name, max_steps = "line", 20
-    action_low, action_high = np.array([-1.0]), np.array([2.0])
 
     def __init__(self, draws: bool = True):
         self.draws = draws
 
     def version(self) -> str:
         return "line 1"
+
+    def limits(self) -> Limits:
+        return Limits(("x",), np.array([-1.0]), np.array([2.0]), np.array([np.inf]))
 
     def fits(self, demos, observation_set):
         return None
@@ -199,6 +202,28 @@ def test_every_question_has_the_same_number_of_rows():
 def test_actions_are_clipped_to_the_action_space():
     results = rollout(Creeper(step=-5.0), Line(), SET, [0], name="creeper", history=1, max_steps=3)
     np.testing.assert_array_equal(results.paths[0, :, 0], [0, -1, -1, -1])
+
+
+def test_the_safety_layer_counts_and_stops():
+    """The first keeps its limits; the second does so for 4 frames; the third is NaN from its second question on."""
+
+    class Odd(Creeper):
+        def predict(self, observations):
+            chunk = super().predict(observations)
+            chunk[0, 1, 4:] = 9.0
+            chunk[0, 2] = np.nan if len(self.asked) > 1 else chunk[0, 2]
+            return chunk
+
+    limits = replace(Line().limits(), high=np.array([0.9]))
+    results = rollout(Odd(step=0.001), Line(), SET, [0, 1, 2], name="o", history=1, limits=limits, batch=3)
+    assert results.interventions.tolist() == [0, 16, 1]
+    assert results.stopped.tolist() == [RUNS, RUNS, NOT_FINITE]
+    assert results.steps.tolist() == [20, 20, 8]
+    assert results.success.tolist() == [False] * 3
+    stopping = replace(limits, stop_after=3)
+    results = rollout(Odd(step=0.001), Line(), SET, [0, 1, 2], name="o", history=1, limits=stopping, batch=3)
+    assert results.stopped.tolist() == [RUNS, REPEATED, NOT_FINITE]
+    assert results.steps.tolist() == [20, 6, 8]
 
 
 class Walk(Line):

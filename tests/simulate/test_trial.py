@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.simulate.trial import load_rollouts, save_rollouts
-from pipeline.types import Rollouts
+from pipeline.types import Execution, Rollouts
 
 
 def rolled(**changes) -> Rollouts:
@@ -23,11 +23,15 @@ def rolled(**changes) -> Rollouts:
     [
         {},
         {
+            "execution": Execution(1, ensemble=True, delay=1), "interventions": np.array([0, 3, 1]),
+            "stopped": np.array([0, 0, 1]),
+        },
+        {
             "simulator": "so101", "best_coverage": np.full(3, np.nan), "paths": None, "stage_names": ("near", "done"),
             "stages": np.array([[True, True], [True, False], [False, False]]),
         },
     ],
-    ids=["in the plane", "with stages"],
+    ids=["in the plane", "as an ensemble, guarded", "with stages"],
 )  # fmt: skip
 def test_written_and_read_again(tmp_path, changes):
     written = rolled(**changes)

@@ -51,6 +51,19 @@ def test_how_chunks_were_carried_out_is_said_where_it_is_not_as_usual(table):
     assert driven_words(table) == ["mlp_k04 was rolled out with 2 actions of each chunk, 1 frame late"]
 
 
+def test_what_the_safety_layer_did_and_why_there_are_no_roll_outs_is_said(table):
+    rolled = next(row for row in table["policies"] if row["rollouts"])["rollouts"]
+    rolled |= {"interventions": 0, "intervened": 0.0, "stopped": 0, "stopped_not_finite": 0}
+    assert driven_words(table) == []
+    rolled |= {"interventions": 30, "intervened": 0.0123, "stopped": 4, "stopped_not_finite": 3}
+    table["policies"][0]["no_rollouts"] = "it does not fit"
+    assert driven_words(table) == [
+        "the safety layer stepped in (share of the frames): mlp_k04 1.2 % (4 of 50 episodes stopped, 3 for actions that are not "
+        "finite)",
+        "no roll-outs of mlp_k01: it does not fit",
+    ]
+
+
 def test_nothing_is_called_better_without_a_test(table):
     table["comparisons"] = []
     for row in table["policies"]:

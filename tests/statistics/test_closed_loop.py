@@ -4,9 +4,10 @@ import json
 
 import numpy as np
 
+from pipeline.safety import NOT_FINITE, RUNS
 from pipeline.statistics.closed_loop import summarise_rollouts
 from pipeline.statistics.success import clopper_pearson
-from pipeline.types import Rollouts
+from pipeline.types import Execution, Rollouts
 
 
 def rolled(coverage: np.ndarray, **stages) -> Rollouts:
@@ -23,6 +24,20 @@ def test_a_task_with_a_coverage_keeps_it_and_has_no_stages():
     assert summary["success_interval"] == list(clopper_pearson(1, 2))
     assert "stages" not in summary
     assert summary["best_coverage"] == 0.73
+
+
+def test_what_the_safety_layer_did_is_counted():
+    guarded = rolled(
+        np.array([0.96, 0.5]),
+        interventions=np.array([3, 0]),
+        stopped=np.array([NOT_FINITE, RUNS]),
+        execution=Execution(4),
+    )
+    summary = summarise_rollouts(guarded)
+    assert (summary["interventions"], summary["stopped"], summary["stopped_not_finite"]) == (3, 1, 1)
+    assert summary["intervened"] == 3 / (9 + 20 + 1)
+    assert summary["execution"] == {"execute": 4, "ensemble": False, "delay": 0}
+    assert "interventions" not in summarise_rollouts(rolled(np.array([0.96, 0.5])))
 
 
 def test_a_task_with_stages_counts_them():

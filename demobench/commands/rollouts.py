@@ -1,0 +1,143 @@
+"""`demobench rollouts`: trained policies in closed loop, chunk × executed actions × delay. What does not belong here: the loop."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from demobench.commands.session import open_session, write_json_to
+from demobench.commands.trained import Found, find_trained
+from pipeline.errors import ConfigError
+from pipeline.execution import settled
+from pipeline.experiment import parse_numbers
+from pipeline.types import Execution
+
+
+def run_rollouts(
+    address: str,
+    *,
+    execute: str | None,
+    delay: str | None,
+    ensemble: bool,
+    starts: int,
+    first: int | None,
+    config_path: Path | None,
+    store_path: str | None,
+    json_to: str | None,
+) -> None:
+    """Roll trained policies out in every way asked for; nothing of it is kept in the store.
+
+    Raises
+    ------
+    ConfigError : nothing of what was asked for can be carried out.
+    NotApplicableError : the data set has no simulator that is installed and fits.
+    """
+    from pipeline.simulate.trial import roll_out
+    from pipeline.statistics.closed_loop import summarise_rollouts
+
+    session = open_session(config_path, store_path, json_to)
+    asked = _asked(parse_numbers("--execute", execute, 1), parse_numbers("--delay", delay, 0), ensemble)
+    found = find_trained(address, session)
+    first = found[0].task.experiment.rollouts if first is None else first
+    pairs, left_out = _that_can_be(found, asked)
+    rows = []
+    for one, execution in pairs:
+        with _bar(session.console, f"{one.variant.name}, {_how(execution)}") as on_frame:
+            numbers = range(first, first + starts)
+            rolled = roll_out(one.task, one.folder, on_frame, start_states=numbers, execution=execution)
+        named = {"policy": one.variant.name, "observations": rolled.observations, "chunk": one.variant.chunk}
+        rows.append(named | summarise_rollouts(rolled))
+    if json_to != "-":
+        _show(found[0].plan.key, rows, left_out, (first, starts), session.console)
+    start_states = {"first": first, "n": starts}
+    said = {"dataset": found[0].plan.key, "start_states": start_states, "rows": rows, "left_out": left_out}
+    write_json_to(json_to, said)
+
+
+def _asked(executes: Sequence[int], delays: Sequence[int], ensemble: bool) -> list[Execution | None]:
+    """Every way that is asked for; None alone: as the configuration says."""
+    if not (executes or delays or ensemble):
+        return [None]
+    plain = [Execution(e, False, d) for e, d in product(executes or (None,), delays or (0,))]
+    return (plain if executes or not ensemble else []) + [
+        Execution(None, True, d) for d in (delays or (0,)) if ensemble
+    ]
+
+
+def _that_can_be(
+    found: Sequence[Found], asked: Sequence[Execution | None]
+) -> tuple[list[tuple[Found, Execution]], list[dict[str, Any]]]:
+    """Every policy in every way that its chunk allows, and what is left out and why."""
+    pairs, left_out = [], []
+    for one, execution in product(found, asked):
+        wanted = execution or one.task.policy.execution
+        try:
+            pairs.append((one, settled(wanted, one.variant.chunk or 1)))
+        except ConfigError as why:
+            left_out.append({"policy": one.variant.name, "execution": asdict(wanted), "why": str(why)})
+    if not pairs:
+        raise ConfigError(f"{left_out[0]['policy']}: {left_out[0]['why']}")
+    return list({(one.variant.name, execution): (one, execution) for one, execution in pairs}.values()), left_out
+
+
+@contextmanager
+def _bar(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar while it works, on a terminal."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
+        task = bars.add_task(escape(what), total=None)
+        yield lambda done, total: bars.update(task, completed=done, total=total)
+
+
+def _how(execution: Execution) -> str:
+    how = "ensemble" if execution.ensemble else f"{execution.execute} executed"
+    return f"{how}, delay {execution.delay}"
+
+
+def _show(
+    key: str,
+    rows: Sequence[Mapping[str, Any]],
+    left_out: Sequence[Mapping[str, Any]],
+    at: tuple[int, int],
+    console: Console,
+) -> None:
+    first, starts = at
+    console.print(
+        f"[bold]{escape(key)}[/]: {escape(rows[0]['observations'])}, start states {first} to {first + starts - 1} of "
+        f"{rows[0]['simulator']}, seed 0 of fold 0",
+        soft_wrap=True,
+    )
+    table = Table()
+    for head in ("policy", "chunk", "executed", "delay", "success", "95 %", "score", "stepped in", "stopped"):
+        table.add_column(head.replace(" ", "\n"), no_wrap=True, justify="left" if head == "policy" else "right")
+    for row in rows:
+        low, high = row["success_interval"]
+        how = row["execution"]
+        table.add_row(
+            escape(row["policy"]), str(row["chunk"]), "ensemble" if how["ensemble"] else str(how["execute"]),
+            str(how["delay"]), f"[bold]{row['successes']}/{row['n']}[/]", f"{100 * low:.0f}–{100 * high:.0f} %",
+            f"{row['score']:.3f}", f"{100 * row['intervened']:.2g} %", str(row["stopped"]),
+        )  # fmt: skip
+    console.print(table)
+    for policy in dict.fromkeys(one["policy"] for one in left_out):
+        ways = [_how(Execution(**one["execution"])) for one in left_out if one["policy"] == policy]
+        console.print(
+            f"[yellow]left out of {escape(policy)}:[/] {'; '.join(ways)} (more than the chunk has, or a delay longer than what is "
+            "executed)",
+            soft_wrap=True,
+        )
+    console.print(
+        "Stepped in: the share of frames in which the safety layer passed something else on; stopped: episodes that it ended.\n"
+        "Intervals (Clopper–Pearson) are of each row alone: the best of many is partly luck. Roll it out again from start "
+        "states that chose nothing (--from).",
+        style="dim",
+        soft_wrap=True,
+    )

@@ -1,0 +1,196 @@
+"""`demobench rollouts` and what it shares with `demobench export`: trained policies found, rolled out, refused."""
+
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from assets_defs.launch import open_instance, run_benchmark
+from assets_defs.plan import Unit
+from assets_defs.resources import asset_keys
+from demobench.commands.rollouts import run_rollouts
+from demobench.commands.session import Session
+from demobench.commands.trained import find_trained
+from pipeline.errors import ConfigError, PolicyError, StoreError
+from pipeline.folds import load_fold
+from pipeline.simulate.trial import roll_out
+from pipeline.store import Store
+from pipeline.types import Execution
+from tests.assets_defs.conftest import TinyBenchmark
+
+RAW = {
+    "benchmark": {"seeds": 1, "steps": 3, "rollouts": 2, "threads": 1},
+    "datasets": {
+        "tiny": {
+            "simulator": "pusht", "kind": "position", "circular": ["block_angle_rad"], "exclude": list(range(8, 200)),
+            "observations": {
+                "position": ["observation.state"], "pose": ["observation.state", "observation.environment_state"],
+            },
+        }
+    },
+    "policies": {
+        "mlp": {"method": "mlp", "chunks": [4, 16], "execute": 4},
+        "net": {"method": "mlp", "chunks": [4], "settings": {"blocks": 1, "width": 8}, "observations": ["pose"]},
+        "late": {"method": "mlp", "chunks": [4], "only_when_named": True},
+    },
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> TinyBenchmark:
+    """Eight demonstrations of PushT and trained policies; nothing else of the benchmark."""
+    store = Store(tmp_path_factory.mktemp("driven")).ensure()
+    benchmark = TinyBenchmark("embedded:pusht_sim", store, RAW)
+    target = benchmark.target()
+    store.register(target.key, target.experiment.model_dump(mode="json"))
+    wanted = ("demonstrations", "episode_split", "windows", "trained_policy")
+    units = [unit for unit in benchmark.plan().stale() if unit.kind in wanted]
+    with open_instance(store.root) as instance:
+        names = [v.name for v in target.selected]
+        assert run_benchmark(instance, benchmark.defs(), target.key, asset_keys(units), (), names).is_success
+    return benchmark
+
+
+@pytest.fixture
+def session(made, monkeypatch, tmp_path) -> Session:
+    console = Console(width=120, record=True, file=io.StringIO())
+    session = Session(made.config, tmp_path, made.store, console)
+    monkeypatch.setattr("demobench.commands.rollouts.open_session", lambda *_: session)
+    return session
+
+
+def roll(address, **asked):
+    options = {
+        "execute": None, "delay": None, "ensemble": False, "starts": 3, "first": None, "config_path": None, "store_path": None,
+        "json_to": None,
+    }  # fmt: skip
+    run_rollouts(address, **options | asked)
+
+
+def test_every_chunk_in_every_way_it_allows(session, tmp_path):
+    said = tmp_path / "said.json"
+    roll("tiny/mlp/pose", execute="2,8", delay="0,1", ensemble=True, json_to=str(said))
+    found = json.loads(said.read_text())
+    ways = [(row["chunk"], *row["execution"].values()) for row in found["rows"]]
+    assert ways == [
+        (4, 2, False, 0), (4, 2, False, 1), (4, 1, True, 0), (4, 1, True, 1),
+        (16, 2, False, 0), (16, 2, False, 1), (16, 8, False, 0), (16, 8, False, 1), (16, 1, True, 0), (16, 1, True, 1),
+    ]  # fmt: skip
+    assert [(one["policy"], one["execution"]["delay"]) for one in found["left_out"]] == [("mlp_k04", 0), ("mlp_k04", 1)]
+    assert all("execute = 8" in one["why"] for one in found["left_out"])
+    assert found["start_states"] == {"first": 2, "n": 3}
+    assert all(row["n"] == 3 and row["success_interval"][1] < 1 and "intervened" in row for row in found["rows"])
+    shown = session.console.export_text()
+    assert "left out of mlp_k04: 8 executed, delay 0; 8 executed, delay 1" in shown
+    assert "0/3" in shown
+
+
+def test_left_alone_it_is_as_the_configuration_says(session, made, tmp_path):
+    said = tmp_path / "said.json"
+    roll("tiny/mlp_k16/pose", first=0, starts=2, json_to=str(said))
+    (row,) = json.loads(said.read_text())["rows"]
+    assert row["execution"] == {"execute": 4, "ensemble": False, "delay": 0}
+    (one,) = find_trained("tiny/mlp_k16/pose", session)
+    assert roll_out(one.task, one.folder).execution == Execution(4)
+    assert roll_out(one.task, one.folder).best_reward.mean() == row["score"]
+
+
+@pytest.mark.parametrize(
+    ("address", "options", "error", "message"),
+    [
+        (
+            "tiny/mlp",
+            {},
+            ConfigError,
+            "several observation sets: position, pose. Name one, for example tiny/mlp/position",
+        ),
+        ("tiny/mlp/front", {}, ConfigError, "not trained with an observation set 'front'"),
+        ("tiny/milp/pose", {}, ConfigError, "no policy 'milp'. Did you mean 'mlp'"),
+        ("tin/mlp/pose", {}, ConfigError, "No data set 'tin'.*Did you mean 'tiny'"),
+        ("tiny", {}, ConfigError, "'tiny' names no policy"),
+        ("tiny/hold_still", {}, ConfigError, "is a baseline"),
+        ("tiny/late_k04/pose", {}, StoreError, "no up-to-date weights of late_k04.*demobench run tiny --policies late"),
+        ("tiny/mlp_k04/pose", {"execute": "5"}, ConfigError, "mlp_k04: execute = 5 needs a chunk of at least 5"),
+        ("tiny/mlp_k04/pose", {"execute": "0"}, ConfigError, "--execute takes whole numbers of at least 1"),
+        ("tiny/mlp_k04/pose", {"delay": "x"}, ConfigError, "--delay takes whole numbers of at least 0"),
+    ],
+)
+def test_what_names_nothing_is_one_message(session, address, options, error, message):
+    with pytest.raises(error, match=message):
+        roll(address, **options)
+
+
+def replaced(one, tmp_path, **files):
+    """The folder of a policy's weights with some files of others."""
+    folder = tmp_path / "weights"
+    shutil.copytree(one.folder, folder)
+    for name, source in files.items():
+        shutil.copy(source / "fold_0" / f"{name}.{'json' if name == 'policy' else 'safetensors'}", folder / "fold_0")
+    return folder
+
+
+def test_weights_of_another_architecture_or_data_set_are_refused(session, made, tmp_path):
+    (one,) = find_trained("tiny/mlp_k04/pose", session)
+    (long,) = find_trained("tiny/mlp_k16/pose", session)
+    (net,) = find_trained("tiny/net/pose", session)
+    (blind,) = find_trained("tiny/mlp_k04/position", session)
+    with pytest.raises(PolicyError, match="their chunk is 16, expected 4. Somebody replaced them"):
+        load_fold(one.task, long.folder, 0)
+    with pytest.raises(PolicyError, match="cannot be read.*expected"):
+        load_fold(one.task, replaced(one, tmp_path / "a", weights=long.folder), 0)
+    with pytest.raises(PolicyError, match="cannot be read|another architecture"):
+        load_fold(net.task, replaced(net, tmp_path / "b", weights=one.folder), 0)
+    with pytest.raises(PolicyError, match="sees 2 columns and was given 5: it was trained on another data set or"):
+        roll_out(one.task, replaced(one, tmp_path / "c", weights=blind.folder, policy=blind.folder))
+    folder = replaced(one, tmp_path / "d")
+    described = json.loads((folder / "fold_0/policy.json").read_text())
+    described["trained_on"]["content_hash"] = "0123456789abcdef"
+    (folder / "fold_0/policy.json").write_text(json.dumps(described))
+    with pytest.raises(PolicyError, match="their data set .* is 0123456789ab, expected"):
+        load_fold(one.task, folder, 0)
+
+
+def test_weights_of_another_width_are_another_architecture(session, tmp_path):
+    (net,) = find_trained("tiny/net/pose", session)
+    folder = replaced(net, tmp_path)
+    described = json.loads((folder / "fold_0/policy.json").read_text())
+    described["settings"]["made_with"]["width"] = 16
+    (folder / "fold_0/policy.json").write_text(json.dumps(described))
+    with pytest.raises(PolicyError, match="of another architecture than policy.json beside them says"):
+        load_fold(net.task, folder, 0)
+
+
+def test_one_policy_that_cannot_be_rolled_out_leaves_the_others(made):
+    """Its record says why; the check that would hold the table back passes."""
+    from assets_defs.policies import _roll_out
+
+    class Bench:
+        plan, store, experiment = made.plan(), made.store, made.target().experiment
+
+        def progress(self, *_):
+            pass
+
+    import assets_defs.policies as policies
+
+    variant = next(v for v in made.target().selected if v.name == "mlp_k04")
+    unit = Unit("mlp_k04/rollouts", "pose")
+    task = find_trained("tiny/mlp_k04/pose", Session(made.config, made.store.root, made.store, Console()))[0].task
+    weights = made.plan().folder(Unit("mlp_k04/trained_policy", "pose")) / "fold_0/weights.safetensors"
+    kept = weights.read_bytes()
+    from safetensors.numpy import load_file, save_file
+
+    arrays = load_file(weights)
+    arrays["layer2.bias"] = np.full_like(arrays["layer2.bias"], np.nan)
+    try:
+        save_file(arrays, weights)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(policies, "_task", lambda *_: task)
+            outcome = _roll_out(Bench(), variant, unit, made.store.root)
+    finally:
+        weights.write_bytes(kept)
+    assert outcome.summary["rollouts"] is None
+    assert "'mlp_k04' answered with NaN or infinite actions in a roll-out" in outcome.summary["why_not"]
+    assert outcome.checks["sane"][0]
