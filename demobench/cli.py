@@ -267,6 +267,25 @@ def rollouts(
 
 @app.command(
     epilog="""Examples:\n
+    demobench export tape/mlp_k16 mlp_k16.onnx\n
+    demobench export pusht_sim/act_k16/pose act.onnx --seed 2 --json -"""
+)
+def export(
+    address: Annotated[str, typer.Argument(metavar="POLICY", help="dataset/policy[/observations].")],
+    out: Annotated[Path, typer.Argument(metavar="OUT.onnx", help="The file to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="Which of its training seeds.")] = 0,
+    config: ConfigOption = None,
+    store: StoreOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """A trained network as an ONNX file for a robot: raw observations in, raw actions out, checked against PyTorch."""
+    from demobench.commands.export import run_export
+
+    run_export(address, out, seed=seed, config_path=config, store_path=store, json_to=json_to)
+
+
+@app.command(
+    epilog="""Examples:\n
     demobench split tape                                         which episodes every fold holds out\n
     demobench split tape --format lerobot --fold 0               what LeRobot's trainer takes\n
     demobench split tape --format json --fold 0 --out fold0.json for score --trained-on"""

@@ -11,6 +11,7 @@ from rich.console import Console
 from assets_defs.launch import open_instance, run_benchmark
 from assets_defs.plan import Unit
 from assets_defs.resources import asset_keys
+from demobench.commands.export import run_export
 from demobench.commands.rollouts import run_rollouts
 from demobench.commands.session import Session
 from demobench.commands.trained import find_trained
@@ -58,7 +59,8 @@ def made(tmp_path_factory) -> TinyBenchmark:
 def session(made, monkeypatch, tmp_path) -> Session:
     console = Console(width=120, record=True, file=io.StringIO())
     session = Session(made.config, tmp_path, made.store, console)
-    monkeypatch.setattr("demobench.commands.rollouts.open_session", lambda *_: session)
+    for command in ("rollouts", "export"):
+        monkeypatch.setattr(f"demobench.commands.{command}.open_session", lambda *_: session)
     return session
 
 
@@ -121,6 +123,44 @@ def test_left_alone_it_is_as_the_configuration_says(session, made, tmp_path):
 def test_what_names_nothing_is_one_message(session, address, options, error, message):
     with pytest.raises(error, match=message):
         roll(address, **options)
+
+
+# Export -------------------------------------------------------------------------------------------------------------------
+
+
+def write(address, out, seed=0, json_to=None):
+    run_export(address, out, seed=seed, config_path=None, store_path=None, json_to=json_to)
+
+
+def test_a_network_of_the_store_as_a_file(session, tmp_path):
+    write("tiny/mlp_k16/pose", tmp_path / "net.onnx", json_to=str(tmp_path / "said.json"))
+    said = json.loads((tmp_path / "said.json").read_text())
+    assert said["inputs"] == {"observations": [1, 3, 5]}
+    assert (said["output"], said["compared"], said["metadata"]["key"]) == ([1, 16, 2], 100, "tiny")
+    assert said["metadata"]["action_units"] == ["px", "px"]
+    assert said["most_off"] < 0.1
+    shown = session.console.export_text().replace("\n", " ")
+    assert "observations [1, 3, 5] → actions [1, 16, 2], float32, raw units" in shown
+    assert (tmp_path / "net.onnx").stat().st_size == said["bytes"]
+
+
+@pytest.mark.parametrize(
+    ("address", "out", "seed", "message"),
+    [
+        ("tiny/mlp/pose", "a.onnx", 0, "stands for several policies: mlp_k04, mlp_k16. Export one of them"),
+        ("tiny/mlp_k04/pose", "a.txt", 0, "is no place for an ONNX file. Name one that ends in .onnx"),
+        ("tiny/mlp_k04/pose", "no/a.onnx", 0, "in a folder that exists"),
+        ("tiny/mlp_k04/pose", "a.onnx", 1, "mlp_k04 has no seed 1. Its seeds are 0"),
+        ("tiny/hold_still", "a.onnx", 0, "is a baseline"),
+    ],
+)
+def test_what_cannot_be_exported_is_one_message(session, tmp_path, address, out, seed, message):
+    with pytest.raises(ConfigError, match=message):
+        write(address, tmp_path / out, seed)
+    assert list(tmp_path.iterdir()) == []
+
+
+# Weights that are not a policy's own --------------------------------------------------------------------------------------
 
 
 def replaced(one, tmp_path, **files):
