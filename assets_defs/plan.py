@@ -28,7 +28,7 @@ CODE_VERSIONS = {
     "action_modes": "2",
     "learning_curve": "1",
     "trained_policy": "1",
-    "predictions": "2",
+    "predictions": "3",
     "rollouts": "2",
     "scored_predictions": "2",
     "benchmark_table": "5",
@@ -273,7 +273,9 @@ class Plan:
                 )
                 return settings | ({"safety": e.dataset.safety} if e.dataset.safety != SafetyConfig() else {})
             case "benchmark_table":
-                return {"name": e.name, "budget": e.budget_words, "champion": e.dataset.champion}
+                settings = {"name": e.name, "budget": e.budget_words, "champion": e.dataset.champion}
+                late = {v.name: how for v in self.variants if (how := _execution(v, e))}
+                return settings | ({"execution": late} if late else {})
             case _:
                 return {}
 

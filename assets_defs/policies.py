@@ -177,6 +177,7 @@ def _predictions(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDef
                 m.summary["metrics"]["first_step_mae"],
                 m.summary["metrics"]["vs_hold_still"],
                 m.summary["latency_ms"],
+                m.summary["latency_p99_ms"],
             )
             for entry, m in made.items()
         ]
@@ -185,7 +186,7 @@ def _predictions(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDef
             for unit in bench.plan.selected_units(variant, "predictions")
         }
         numbers = {f"first_step_mae_{row[0]}": dg.MetadataValue.float(row[1]) for row in rows if row[1] is not None}
-        header = ["observations", "first-step MAE", "× hold-still", "latency, ms"]
+        header = ["observations", "first-step MAE", "× hold-still", "latency, ms", "99th percentile, ms"]
         metadata = {"scores": table(header, rows), **numbers, **plots}
         return result(bench, asset_key, made, present(metadata), ["finite", "every_held_out_episode"])
 

@@ -18,6 +18,8 @@ from pipeline.windows import Windows
 
 BLOCK = 2048
 """Anchors asked at a time."""
+FEWEST = 20
+"""Calls that a latency is measured on, at least."""
 
 ARRAYS = ("anchors", "fold", "actions")
 """The arrays of `Predictions`, a file each."""
@@ -92,17 +94,22 @@ def load_predictions(folder: Path) -> Predictions:
         raise StoreError(f"The predictions in {folder} cannot be read ({error}). Run the benchmark again.") from None
 
 
-def latency_ms(policy: Any, windows: Windows, calls: int = 50) -> float:
-    """The median time of one call with one observation, milliseconds, one network; gathering not counted."""
+def latency_ms(policy: Any, windows: Windows, calls: int = 200, most_s: float = 3.0) -> tuple[float, float]:
+    """The median and the 99th percentile of the time of one call with one observation, milliseconds, one network.
+
+    Gathering the observation is not counted. A policy so slow that `calls` would take longer than `most_s` is called less often,
+    at least 20 times.
+    """
     alone = policy.one_seed(0) if hasattr(policy, "one_seed") else policy
     observation = windows.observations(slice(0, 1))
     alone.predict(observation)
-    times = []
-    for _ in range(calls):
+    times: list[float] = []
+    while len(times) < calls and (len(times) < FEWEST or sum(times) < most_s):
         began = time.perf_counter()
         alone.predict(observation)
         times.append(time.perf_counter() - began)
-    return float(np.median(times)) * 1e3
+    median, late = np.percentile(times, [50, 99]) * 1e3
+    return float(median), float(late)
 
 
 MEMORY = 0.01

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.by_task import errors_by_task
+from pipeline.execution import settled
 from pipeline.experiment import Experiment, Variant
 from pipeline.external.pairing import Rival, judge_with_elsewhere
 from pipeline.methods import METHODS
@@ -43,9 +44,9 @@ def build_table(
     facts : what `quality.inspect_dataset` found.
     floors, estimates : the notebook's floors, and those that policies are held against.
     entries : one a row: `variant`, `observations`, `metrics` (`metrics.Score.metrics`), `errors` (`EpisodeErrors`),
-        `windows_train`, `windows_test`, `latency_ms`, `parameters`, `train_s` and `rollouts` (a summary or None). One that was
-        predicted elsewhere also has `elsewhere`: `seen_in_training`, `training` (words), `episodes`, `samples`, `warnings` and
-        `sight_stated`.
+        `windows_train`, `windows_test`, `latency_ms`, `latency_p99_ms`, `parameters`, `train_s`, `rollouts` (a summary or None)
+        and `no_rollouts` (why there are none where there could be). One that was predicted elsewhere also has `elsewhere`:
+        `seen_in_training`, `training` (words), `episodes`, `samples`, `warnings` and `sight_stated`.
     modes : `modes.ModesEvidence` as dictionaries.
 
     Returns
@@ -225,6 +226,7 @@ def _row(entry: Mapping[str, Any], experiment: Experiment, facts: Mapping[str, A
         "cpu_s": entry.get("cpu_s"),
         "vram_mb": entry.get("vram_mb"),
         "latency_ms": entry["latency_ms"],
+        **_deadline(entry, experiment, facts["fps"]),
         "verdict": {
             "vs_hold_still": None,
             "vs_champion": None,
@@ -238,6 +240,19 @@ def _row(entry: Mapping[str, Any], experiment: Experiment, facts: Mapping[str, A
         "by_task": errors_by_task(entry["errors"], facts["episode_tasks"], experiment.protocol),
         **entry.get("elsewhere", {}),
     }
+
+
+def _deadline(entry: Mapping[str, Any], experiment: Experiment, fps: float) -> dict[str, Any]:
+    """How late a call is now and then, against the time that there is for it: until the next question, or, where a delay is
+    reckoned with, that delay. None where nothing asks it in time: baselines, and what was predicted elsewhere."""
+    variant, late = entry["variant"], entry.get("latency_p99_ms")
+    policy = experiment.policies.get(variant.family)
+    found = {"latency_p99_ms": late, "deadline_ms": None, "misses_deadline": None, "execution": None}
+    if late is None or policy is None or not variant.is_trained:
+        return found
+    execution = settled(policy.execution, variant.chunk or 1)
+    deadline = 1e3 / fps * (execution.delay or execution.execute)
+    return found | {"deadline_ms": deadline, "misses_deadline": late > deadline, "execution": asdict(execution)}
 
 
 def _best_first(row: Mapping[str, Any]) -> tuple:

@@ -1,5 +1,7 @@
 """Asking policies: in blocks, over folds, and as a temporal ensemble against a loop."""
 
+import time
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +12,7 @@ from pipeline.errors import StoreError
 from pipeline.methods import METHODS
 from pipeline.policies import Plan
 from pipeline.predict import (
+    FEWEST,
     join_folds,
     latency_ms,
     load_predictions,
@@ -87,7 +90,23 @@ def test_predictions_that_are_not_there_are_one_message(tmp_path):
 
 def test_a_call_takes_time(trained):
     windows = lay(random_walks(), (2,))
-    assert 0 < latency_ms(trained.policy, windows, calls=5) < 1000
+    median, late = latency_ms(trained.policy, windows, calls=25)
+    assert 0 < median <= late < 1000
+
+
+def test_a_slow_policy_is_asked_less_often():
+    class Slow:
+        asked = 0
+
+        def predict(self, observation):
+            assert len(observation) == 1
+            self.asked += 1
+            time.sleep(0.02 if self.asked == 7 else 0.002)
+
+    policy = Slow()
+    median, late = latency_ms(policy, lay(random_walks(), (2,)), calls=200, most_s=0.01)
+    assert policy.asked == 1 + FEWEST
+    assert 2 <= median < 10 < late
 
 
 def slow_ensemble(actions, anchors, demos, m):

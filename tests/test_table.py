@@ -45,6 +45,7 @@ def table(tmp_path_factory):
         entries.append({
             "variant": task.variant, "observations": "state", "metrics": score.metrics, "windows_train": 240,
             "windows_test": len(predictions.anchors), "errors": score.errors, "latency_ms": 0.1,
+            "latency_p99_ms": 900.0 if variant == "mlp_k01" else 0.3,
             "parameters": 7 * task.variant.is_trained,
             "train_s": 1.5, "rollouts": ROLLOUTS if variant == "mlp_k01" else None,
         })  # fmt: skip
@@ -86,6 +87,16 @@ def test_it_is_json_without_numbers_that_are_none(table):
     again = json.loads(json.dumps(table, allow_nan=False))
     assert again == table
     assert next(row for row in again["policies"] if row["chunk"] == 32)["first_step_rmse"] is None
+
+
+def test_the_time_there_is_for_a_call_is_that_of_the_actions_carried_out(table):
+    """At 10 fps one action lasts 0.1 s, and of a chunk of 32 eight are carried out."""
+    rows = {row["policy"]: row for row in table["policies"]}
+    period = 1e3 / table["dataset"]["fps"]
+    late = {name: (row["deadline_ms"], row["misses_deadline"]) for name, row in rows.items()}
+    assert late == {"mlp_k01": (period, period < 900), "mlp_k32": (8 * period, False), "hold_still": (None, None)}
+    assert rows["mlp_k32"]["execution"] == {"execute": 8, "ensemble": False, "delay": 0}
+    assert rows["hold_still"]["latency_p99_ms"] == 0.3
 
 
 def test_rows_are_sorted_by_the_first_step(table):

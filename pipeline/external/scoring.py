@@ -54,6 +54,7 @@ class Scored:
             "windows_train": None,
             "windows_test": len(self.predictions.anchors),
             "latency_ms": None,
+            "latency_p99_ms": None,
             "seen_in_training": self.held_out.seen,
             "training": self.held_out.words,
             "episodes": demos.episode_ids[self.held_out.episodes].tolist(),

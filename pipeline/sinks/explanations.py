@@ -11,6 +11,7 @@ from typing import Any
 from pipeline.sinks.findings import (
     NOT_HELD,
     capital,
+    deadline_words,
     driven_words,
     elsewhere_words,
     excluded_words,
@@ -76,7 +77,7 @@ def notes(table: Table) -> list[str]:
         )
     if not any(row["rollouts"] for row in table["policies"]):
         found.append("Closed loop: no simulator for this data set.")
-    found += [f"{capital(words)}." for words in (*driven_words(table), *elsewhere_words(table))]
+    found += [f"{capital(words)}." for words in (*driven_words(table), *deadline_words(table), *elsewhere_words(table))]
     found += _tested(table)
     if not_held(table):
         found.append(f"{capital(NOT_HELD)}.")
@@ -233,7 +234,9 @@ def _common(table: Table) -> dict[str, str]:
             "Pearson. The score is the mean over start states of the best reward of the episode, from 0 to 1."
         )
     entries["Cost"] = (
-        "Parameters of one network; training seconds of all seeds and folds together; latency of one call, median."
+        "Parameters of one network; training seconds of all seeds and folds together; latency of one call, "
+        "median and 99th percentile, measured on the machine that made this page. A policy misses its deadline where the latter "
+        "is longer than the actions last that it carries out of a chunk (or than the delay that its roll-outs reckon with)."
     )
     return entries
 

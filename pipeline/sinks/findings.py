@@ -151,6 +151,19 @@ def driven_words(table: Table) -> list[str]:
     return found + [f"no roll-outs of {', '.join(names)}: {why}" for why, names in reasons.items()]
 
 
+def deadline_words(table: Table) -> list[str]:
+    """Which policies do not answer in time, and what their time is."""
+    found = []
+    for row in (row for row in table["policies"] if row.get("misses_deadline")):
+        how, time = Execution(**row["execution"]), f"{show(row['deadline_ms'])} ms"
+        there = f"roll-outs reckon with {how.delay} frames, {time}" if how.delay else f"it is asked every {time}"
+        found.append(
+            f"{name_in(table, address(row))} misses its deadline: one call in a hundred takes {show(row['latency_p99_ms'])} ms or "
+            f"more on this machine, and {there}"
+        )
+    return found
+
+
 def _safety_words(table: Table) -> list[str]:
     """How often the safety layer stepped in, policy by policy; nothing where it did not have to."""
     rows = [row for row in table["policies"] if (row["rollouts"] or {}).get("interventions")]

@@ -91,7 +91,7 @@ def _columns(table: Mapping[str, Any]) -> list[Column]:
         *columns,
         Column("Params", "one net", lambda row: row["params"], None, lambda row, _: _count(row["params"])),
         Column("Training", "s", lambda row: row["train_s"], None, lambda row, _: _seconds(row["train_s"])),
-        Column("Latency", "ms a call", lambda row: row["latency_ms"], decimals=3),
+        Column("Latency", "ms a call", lambda row: row["latency_ms"], None, _late, 3),
     ]
 
 
@@ -193,6 +193,15 @@ def _success(row: Row, _: str) -> Html:
     interval = rollouts.get("success_interval")
     text = f"{100 * interval[0]:.0f}–{100 * interval[1]:.0f} %" if show_interval(interval) else ""
     return join(element("b", f"{done}/{rollouts['n']}"), element("small", text))
+
+
+def _late(row: Row, shown: str) -> Html | str:
+    """The median, with the 99th percentile and what it misses below."""
+    late = row.get("latency_p99_ms")
+    if not is_number(late):
+        return shown
+    words = f"99 %: {show(late, 3)}" + (", misses its deadline" if row["misses_deadline"] else "")
+    return join(shown, element("small", words))
 
 
 def _count(value: float) -> str:

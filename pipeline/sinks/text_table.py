@@ -14,6 +14,7 @@ from pipeline.sinks.findings import (
     address,
     answer,
     champion,
+    deadline_words,
     driven_words,
     elsewhere_words,
     excluded_words,
@@ -182,7 +183,7 @@ def _columns(table: Mapping[str, Any], unit: str | None) -> list[_Column]:
         *columns,
         _Column("params", lambda row: f"{row['params']:,}" if row["params"] else "—", 3),
         _Column("trained\ns", lambda row: f"{row['train_s']:,.0f}" if row["params"] else "—", 1),
-        _Column("call\nms", number("latency_ms", 2), 2),
+        _Column("call\nms", _call, 2),
     ]
 
 
@@ -225,6 +226,12 @@ def _at_one_second(row: Mapping[str, Any]) -> str:
     """The error, with the mark of its verdict against hold-still at the same horizon."""
     value, word = _number(row["at_one_second_mae"]), row["verdict"]["vs_hold_still_at_one_second"]
     return f"{value} {_verdict(word, mark_only=True)}" if word else value
+
+
+def _call(row: Mapping[str, Any]) -> str:
+    """The median, and the 99th percentile beside it."""
+    late, value = row.get("latency_p99_ms"), _number(row["latency_ms"], 2)
+    return value if late is None else f"{value} [dim]{_number(late, 2)}[/]{' ✗' if row['misses_deadline'] else ''}"
 
 
 def _number(value: float | None, digits: int = 4) -> str:
@@ -272,7 +279,7 @@ def _footnotes(table: Mapping[str, Any]) -> list[str]:
     if any(row["rollouts"] for row in table["policies"]):
         trials = max(row["rollouts"]["n"] for row in table["policies"] if row["rollouts"])
         lines.append(f"success: {trials} start states, one network, Clopper–Pearson 95 % · score: mean best reward")
-    lines += driven_words(table)
+    lines += [*driven_words(table), *deadline_words(table)]
     if any(first_step_gap(row) for row in table["policies"]):
         lines.append(
             "above floor: the first action's RMSE less the least that a policy of what it sees can have (gamma); "

@@ -107,6 +107,8 @@ def test_the_table_says_budgets_and_scores_of_samples(made):
     assert rows["net_k04"]["steps"] == made.store.made(made.plan().folder(TRAINED)).summary["steps"] > 1
     assert rows["net_k04"]["cpu_s"] > 0
     assert rows["net_k04"]["samples"] is None
+    assert 0 < rows["flow_k04"]["latency_ms"] <= rows["flow_k04"]["latency_p99_ms"]
+    assert rows["flow_k04"]["deadline_ms"] == 400  # four actions at 10 fps
     samples = rows["flow_k04"]["samples"]
     assert 0 < samples["energy"]["value"] < samples["of_one"]["value"]
     assert len(samples["by_horizon"]["energy"]) == 4

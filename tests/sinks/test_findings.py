@@ -7,6 +7,7 @@ from pipeline.sinks.findings import (
     ahead,
     answer,
     champion,
+    deadline_words,
     driven_words,
     family,
     gap_parts,
@@ -62,6 +63,21 @@ def test_what_the_safety_layer_did_and_why_there_are_no_roll_outs_is_said(table)
         "finite)",
         "no roll-outs of mlp_k01: it does not fit",
     ]
+
+
+@pytest.mark.parametrize(
+    ("delay", "words"), [(0, "it is asked every 100 ms"), (2, "roll-outs reckon with 2 frames, 100 ms")]
+)
+def test_who_misses_a_deadline_is_said_with_the_deadline(table, delay, words):
+    execution = {"execute": 2, "ensemble": False, "delay": delay}
+    assert deadline_words(table) == []
+    table["policies"][1] |= {
+        "latency_p99_ms": 250.0, "deadline_ms": 100.0, "misses_deadline": True, "execution": execution,
+    }  # fmt: skip
+    (said,) = deadline_words(table)
+    assert (
+        said == f"mlp_k04 misses its deadline: one call in a hundred takes 250 ms or more on this machine, and {words}"
+    )
 
 
 def test_nothing_is_called_better_without_a_test(table):
