@@ -75,7 +75,7 @@ def notes(table: Table) -> list[str]:
         found.append(
             "Action columns have different units, so read “scaled”; a mean over them in raw numbers says little."
         )
-    if not any(row["rollouts"] for row in table["policies"]):
+    if not any(row["rollouts"] or row.get("no_rollouts") for row in table["policies"]):
         found.append("Closed loop: no simulator for this data set.")
     found += [f"{capital(words)}." for words in (*driven_words(table), *deadline_words(table), *elsewhere_words(table))]
     found += _tested(table)
@@ -231,7 +231,9 @@ def _common(table: Table) -> dict[str, str]:
     if trials:
         entries["Success and score"] = (
             f"One trained network (seed 0 of fold 0) from {trials} numbered start states; interval by Clopper and "
-            "Pearson. The score is the mean over start states of the best reward of the episode, from 0 to 1."
+            "Pearson. The score is the mean over start states of the best reward of the episode, from 0 to 1. The safety layer "
+            "passes on what keeps the robot's limits, whatever a policy asks for; it stops an episode where an action is not "
+            "finite, or as the configuration says."
         )
     entries["Cost"] = (
         "Parameters of one network; training seconds of all seeds and folds together; latency of one call, "

@@ -142,7 +142,7 @@ def driven_words(table: Table) -> list[str]:
     for row in (row for row in table["policies"] if row["rollouts"]):
         how = row["rollouts"].get("execution")
         if how and how != asdict(settled(AS_USUAL, row["chunk"] or 1)):
-            found.append(f"{name_in(table, address(row))} was rolled out with {execution_words(Execution(**how))}")
+            found.append(f"roll-outs of {name_in(table, address(row))}: {execution_words(Execution(**how))}")
     reasons: dict[str, list[str]] = {}
     for row in table["policies"]:
         if why := row.get("no_rollouts"):
@@ -158,8 +158,8 @@ def deadline_words(table: Table) -> list[str]:
         how, time = Execution(**row["execution"]), f"{show(row['deadline_ms'])} ms"
         there = f"roll-outs reckon with {how.delay} frames, {time}" if how.delay else f"it is asked every {time}"
         found.append(
-            f"{name_in(table, address(row))} misses its deadline: one call in a hundred takes {show(row['latency_p99_ms'])} ms or "
-            f"more on this machine, and {there}"
+            f"one call in a hundred of {name_in(table, address(row))} takes {show(row['latency_p99_ms'])} ms or more on this "
+            f"machine, and {there}: it misses its deadline"
         )
     return found
 

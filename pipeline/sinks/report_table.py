@@ -86,6 +86,7 @@ def _columns(table: Mapping[str, Any]) -> list[Column]:
         columns += [
             Column("Success", "95 % interval", lambda row: _of(row, "success"), "high", _success),
             Column("Score", "best reward", lambda row: _of(row, "score"), "high", None, 3),
+            *_stepped_in(table),
         ]
     return [
         *columns,
@@ -193,6 +194,18 @@ def _success(row: Row, _: str) -> Html:
     interval = rollouts.get("success_interval")
     text = f"{100 * interval[0]:.0f}–{100 * interval[1]:.0f} %" if show_interval(interval) else ""
     return join(element("b", f"{done}/{rollouts['n']}"), element("small", text))
+
+
+def _stepped_in(table: Mapping[str, Any]) -> list[Column]:
+    """What the safety layer did, where it had anything to do."""
+    if not any(_of(row, "interventions") for row in table["policies"]):
+        return []
+
+    def share(row: Row) -> float | None:
+        found = _of(row, "intervened")
+        return None if found is None else 100 * found
+
+    return [Column("Safety", "stepped in, % of frames", share, None, None, 2)]
 
 
 def _late(row: Row, shown: str) -> Html | str:

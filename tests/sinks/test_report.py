@@ -104,6 +104,26 @@ def test_what_does_not_apply_is_said_once(demos, semantics, table):
         assert absent not in page, absent
 
 
+def test_what_is_behind_closed_loop_numbers_is_said(table, figures):
+    for row, why in zip(table["policies"], ("it does not fit", None, None), strict=True):
+        row["no_rollouts"] = why
+    table["policies"][1]["rollouts"] |= {
+        "interventions": 9, "intervened": 0.0123, "stopped": 0, "stopped_not_finite": 0,
+    }  # fmt: skip
+    table["policies"][1] |= {
+        "latency_p99_ms": 250.0, "deadline_ms": 100.0, "misses_deadline": True,
+        "execution": {"execute": 1, "ensemble": False, "delay": 0},
+    }  # fmt: skip
+    page = text_of(render_report(table, figures, PROVENANCE))
+    assert "stepped in, % of frames" in page
+    assert "1.23" in page
+    assert "99 %: 250.000, misses its deadline" in page
+    assert "One call in a hundred of mlp_k04 takes 250 ms or more on this machine, and it is asked every 100 ms" in page
+    assert "No roll-outs of mlp_k01: it does not fit." in page
+    table["policies"][1]["rollouts"] = None
+    assert "no simulator for this data set" not in text_of(render_report(table, figures, PROVENANCE))
+
+
 def test_mixed_units_are_warned_of(table, figures):
     table["dataset"]["action_units"] = ["rad", "m"]
     assert "Action columns have different units" in text_of(render_report(table, figures, PROVENANCE))
