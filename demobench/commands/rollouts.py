@@ -7,6 +7,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -115,9 +116,9 @@ def _show(
         f"{rows[0]['simulator']}, seed 0 of fold 0",
         soft_wrap=True,
     )
-    table = Table()
-    for head in ("policy", "chunk", "executed", "delay", "success", "95 %", "score", "stepped in", "stopped"):
-        table.add_column(head.replace(" ", "\n"), no_wrap=True, justify="left" if head == "policy" else "right")
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    for head in ("policy", "chunk", "executed", "delay", "success", "95 %", "score", "stepped\nin", "stopped"):
+        table.add_column(head, no_wrap=True, justify="left" if head == "policy" else "right")
     for row in rows:
         low, high = row["success_interval"]
         how = row["execution"]
