@@ -27,6 +27,7 @@ from pipeline.normalize import circular_columns, fit_scaler
 from pipeline.statistics.intervals import FEWEST, t_quantile
 from pipeline.statistics.neighbours import Neighbours, find_neighbours
 from pipeline.statistics.pilot import Pilot, fit_pilot
+from pipeline.statistics.refusals import A_JUMP, CONTRADICTED, NOT_EXPLAINED, TOO_FAR, TOO_SMALL
 from pipeline.types import ACTION, Demonstrations, FloorEstimate, ObservationSet, Semantics, Split
 
 NEAREST = 10
@@ -64,24 +65,6 @@ SMALLEST = 0.01
 SHARE_IN_DOUBT = 0.5
 """Of what the fit takes away from the nearest neighbours, or from the pilot's error, so much joins the interval."""
 
-TOO_FAR = (
-    "the nearest states differ too much: extrapolation to distance zero would take away {:.0f} % of what they show"
-)
-NOT_EXPLAINED = (
-    "the regression that takes the smooth part away is not good enough here: its squared error on held-out episodes is {:.1f} "
-    "times the estimate"
-)
-ADDED = (
-    "what people do changes too quickly with what is seen for the regression that takes the smooth part away: it adds to what "
-    "neighbours differ by"
-)
-TOO_SMALL = (
-    "people disagree by less than {:.0f} % of the actions' deviation, if at all: too little to tell it from zero"
-)
-A_JUMP = (
-    "the mean action may jump from state to state (a gripper that closes): a jump could make up {:.0f} % of the estimate, and "
-    "the data cannot tell"
-)
 NOTHING = {"value": None, "upper": None, "interval": None, "wrong": 0.0}
 
 Loss = Literal["rmse", "mae", "l2"]
@@ -417,7 +400,7 @@ def _doubt(states: States, pilot: Pilot, pairs: Pairs, apart: np.ndarray, record
         return Doubt(refused=NOT_EXPLAINED.format(explained / estimate), by_pilot=True)
     plain = _intercept(pairs, recorded)
     if MOST_KEPT * estimate > plain.value + t_quantile(0.975, pairs.df) * plain.error:
-        return Doubt(refused=ADDED, by_pilot=True)
+        return Doubt(refused=CONTRADICTED, by_pilot=True)
     if jump.value > JUMPY * estimate:
         return Doubt(refused=A_JUMP.format(min(100.0, 100 * jump.value / estimate)))
     if jump.value > SURE_OF_JUMP * jump.error:

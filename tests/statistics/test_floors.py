@@ -168,7 +168,7 @@ def test_only_held_out_states_are_scored():
         ),
         (
             lambda d: demonstrations({STATE: d.columns[STATE], ACTION: wiggles(d.columns[STATE], 8)}, d.lengths),
-            "it adds to what neighbours differ by",
+            "two ways of extrapolating contradict each other",
         ),
         (
             lambda d: demonstrations({STATE: d.columns[STATE], ACTION: wiggles(d.columns[STATE], 20)}, d.lengths),
