@@ -31,8 +31,8 @@ CODE_VERSIONS = {
     "predictions": "3",
     "rollouts": "2",
     "scored_predictions": "2",
-    "benchmark_table": "5",
-    "benchmark_report": "6",
+    "benchmark_table": "6",
+    "benchmark_report": "7",
     "mcap_log": "1",
     "rerun_recording": "1",
 }

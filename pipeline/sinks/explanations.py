@@ -18,7 +18,6 @@ from pipeline.sinks.findings import (
     families_words,
     family,
     first_step_gap,
-    key_of,
     not_held,
     without_floor,
 )
@@ -93,7 +92,7 @@ def _tested(table: Table) -> list[str]:
     if any(row["verdict"]["vs_hold_still"] for row in table["policies"]):
         said.append(
             f"The words under a number are tests against hold-still at the same horizon: {families_words(table)} The order "
-            f"of the other rows is not tested here; demobench compare {key_of(table)} tests all pairs."
+            "of the other rows is not tested here; demobench compare tests any two of them, or all pairs."
         )
     else:
         said.append("No difference between policies is tested here; where intervals overlap the order may be chance.")

@@ -282,8 +282,8 @@ def _second(table: Table, rows: Sequence[Row], best: Row) -> list[Sentence]:
         return [["It is ", Strong("better than the second"), f", {name}."]]
     if found := forth or back:
         return [["It ", Strong("cannot be told from the second"), f", {name}: {found['words']}."]]
-    all_pairs = f"demobench compare {key_of(table)}"
-    return [["Whether it is better than the second, ", name, f", is not tested here; {all_pairs} tests all pairs."]]
+    both = " ".join(f"{key_of(table)}/{address(row)}" for row in (best, second))
+    return [["Whether it is better than the second, ", name, f", is not tested here; demobench compare {both} tells."]]
 
 
 def _best_driven(rows: Sequence[Row]) -> Sentence:
@@ -303,7 +303,7 @@ def _how_far(row: Row) -> Sentence:
     if not rollouts.get("stages"):
         return []
     counts = (f"{stage} {count}" for stage, count in zip(rollouts["stages"], rollouts["stage_counts"], strict=True))
-    return [f" Of {rollouts['n']} episodes: {', '.join(counts)}."]
+    return [f" Of its {rollouts['n']} roll-outs: {', '.join(counts)}."]
 
 
 # Floors ---------------------------------------------------------------------------------------------------------------
@@ -410,10 +410,30 @@ def _first_step_floor(table: Table, best: Row) -> list[Sentence]:
     why = without_floor(table).get(best["observations"])
     if why is None:
         return []
+    if span := _first_step_span(table, best):
+        return [span]
     floor = floors_at_first_step(table)[best["observations"]]
     limit = limit_words(table, floor, bracket_of(table, floor))
     rest = f" The floor of the RMSE is {limit}." if limit else ""
     return [[Strong("No floor"), f" can be given at the first action: {why.split(': ')[0]}.{rest}"]]
+
+
+def _first_step_span(table: Table, best: Row) -> Sentence | None:
+    """Where the floor of the MAE lies at the first action, and whether the best row is there; None where it is refused."""
+    where = (best["observations"], 0, "mae")
+    floor = next((f for f in floors_of(table) if (f["observations"], f["horizon"], f["loss"]) == where), None)
+    if floor is None or why_not(floor, bracket_of(table, floor)) is not None or not is_number(floor["value"]):
+        return None
+    places = decimals_for([floor["upper"]])
+    span = f"{show(floor['value'], places)} and {show(floor['upper'], places)}{dataset_unit(table)}"
+    interval = show_interval(floor["interval"], places)
+    there = (
+        "it is above, so there is room for a better policy"
+        if best["first_step_mae"] > floor["interval"][1]
+        else "it may be there already"
+    )
+    sees = f" {interval} for policies seeing {best['observations']}: {there}."
+    return ["At the first action the floor of the MAE lies between ", Strong(span), sees]
 
 
 def _later_floor(table: Table, best: Row) -> list[Sentence]:
@@ -421,7 +441,8 @@ def _later_floor(table: Table, best: Row) -> list[Sentence]:
     known = [b for b in table["brackets"] if b["horizon"] > 0 and b["lower"] is not None and b["loss"] != "l2"]
     if not known:
         return []
-    sees = best["observations"]
+    later = [row for row in table["policies"] if ranks(row) and is_number(row["at_one_second_mae"])]
+    sees = min(later, key=lambda row: row["at_one_second_mae"], default=best)["observations"]
     found = min(known, key=lambda b: (-b["horizon"], b["observations"] != sees, b["loss"] != "rmse", b["upper"]))
     when, unit, loss = ahead(found["horizon"], table["dataset"]["fps"]), dataset_unit(table), LOSSES[found["loss"]]
     said = [f"{capital(when)} ", Strong(name_in(table, found["upper_policy"]))]

@@ -114,6 +114,8 @@ def _gap(values: np.ndarray, episodes: np.ndarray, fold: np.ndarray, floor: Floo
     centre = squared - floor.value**2
     # From the squared scale to the unit: a gap x of squares is an error less the root of what is left of its square.
     low, high = (float(error - np.sqrt(max(0.0, squared - x))) for x in (centre - half, centre + half))
+    if floor.estimator == "pair_distance" and sure:
+        high = min(high, sure[1] - floor.interval[0])  # a span is wide beside what pairing saves
     return Gap(error, sure, error - floor.value, (low, high), _gap_words(floor, error - floor.value, low, high))
 
 

@@ -15,6 +15,6 @@ TOO_SMALL = (
     "people disagree by less than {:.0f} % of the actions' deviation, if at all: too little to tell it from zero"
 )
 A_JUMP = (
-    "the mean action may jump from state to state (a gripper that closes): a jump could make up {:.0f} % of the estimate, and "
+    "the mean action may jump from state to state (as where a gripper closes): a jump could make up {:.0f} % of the estimate, and "
     "the data cannot tell"
 )

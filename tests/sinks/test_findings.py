@@ -18,7 +18,7 @@ from pipeline.sinks.findings import (
     without_floor,
 )
 
-from .making import make_bracket, make_comparison, make_gap, make_refusal, make_row, make_verdict
+from .making import make_bracket, make_comparison, make_floor, make_gap, make_refusal, make_row, make_verdict
 
 
 def said(table) -> list[str]:
@@ -29,7 +29,8 @@ def test_the_answer_of_a_benchmark(table):
     assert said(table) == [
         "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]. It is better than hold-still, whose "
         "error is 4.44 times as large.",
-        "Whether it is better than the second, mlp_k04, is not tested here; demobench compare small tests all pairs.",
+        "Whether it is better than the second, mlp_k04, is not tested here; demobench compare small/mlp_k01/state "
+        "small/mlp_k04/state tells.",
         "It is 1.62 px RMSE above the floor [1.25, 2.00]: for policies seeing state that is 4.00 px RMSE at the first action.",
         "In closed loop mlp_k04 seeing state succeeds most often: 41 of 50 (69–91 %).",
     ]
@@ -41,7 +42,7 @@ def test_where_a_task_has_stages_they_are_counted(table, success):
     """Those of the policy that succeeds most often, or comes closest."""
     stages = {"stages": ["reached", "grasped", "placed"], "stage_counts": [48, 17, round(50 * success)]}
     next(row for row in table["policies"] if row["rollouts"])["rollouts"] |= {"success": success} | stages
-    assert said(table)[-1].endswith(f". Of 50 episodes: reached 48, grasped 17, placed {round(50 * success)}.")
+    assert said(table)[-1].endswith(f". Of its 50 roll-outs: reached 48, grasped 17, placed {round(50 * success)}.")
 
 
 def test_how_chunks_were_carried_out_is_said_where_it_is_not_as_usual(table):
@@ -154,6 +155,23 @@ def test_hold_still_can_be_the_champion(table):
     for row in table["policies"][:2]:
         row["verdict"] = make_verdict(vs_hold_still="better", vs_champion="better")
     assert champion(table) == "hold_still/state"
+
+
+@pytest.mark.parametrize(
+    ("interval", "there"),
+    [([1.9, 3.6], "it is above, so there is room for a better policy"), ([1.9, 4.6], "it may be there already")],
+)
+def test_where_squared_errors_have_no_floor_the_absolute_ones_are_asked(table, interval, there):
+    for row in table["policies"]:
+        row["above_floor"] = []
+    mae = make_floor("mae", value=1.6, upper=3.2, interval=interval)
+    table["floor"]["estimates"] = [make_refusal(), mae]
+    table["brackets"] = [make_bracket(lower=None, words="refused"), make_bracket("mae")]
+    (found,) = [sentence for sentence in said(table) if "floor of the MAE" in sentence]
+    assert found.startswith("At the first action the floor of the MAE lies between 1.60 and 3.20 px [1.90, ")
+    assert found.endswith(f"for policies seeing state: {there}.")
+    mae["refused"], mae["value"] = "too far", None
+    assert not [sentence for sentence in said(table) if "floor of the MAE" in sentence]
 
 
 def test_a_refused_floor_is_said_with_what_is_known(table):

@@ -51,6 +51,14 @@ def scored(name, demos, predicted, sight=POSE, **more):
     return Scored(name, "pose", sight, errors_of(demos, predicted, **more))
 
 
+def test_what_can_be_gained_at_most_is_no_more_than_both_intervals_allow():
+    demos, mean = task(episodes=40)
+    policy = scored("off", demos, mean + 2.0)
+    (floor,) = [f for f in floors_of(demos) if f.loss == "mae"]
+    found = gap_to_floor(policy, floor)
+    assert 0 < found.interval[1] <= found.error_interval[1] - floor.interval[0] < found.error_interval[1]
+
+
 def test_a_perfect_policy_is_at_the_floor():
     demos, mean = task()
     found = gap_to_floor(scored("perfect", demos, mean), floors_of(demos)[0])
