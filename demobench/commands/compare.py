@@ -335,9 +335,18 @@ def show_verdicts(verdicts: Sequence["Comparison"], family: int, entries: Sequen
     for metric in TITLES:
         if rows := [verdict for verdict in verdicts if verdict.metric == metric]:
             unit = entries[0].unit if metric != "success" else None
-            grid, gave_way = _fit(f"{TITLES[metric]}{f', {unit}' if unit else ''}", rows, short, console)
+            title = f"{TITLES[metric]}{f', {unit}' if unit else ''}"
+            if len(rows) > MANY and len({(row.word, row.words) for row in rows}) == 1:
+                console.print(
+                    f"{title}: all {len(rows)} pairs: {escape(rows[0].word)}: {escape(rows[0].words)}", soft_wrap=True
+                )
+                continue
+            grid, gave_way = _fit(title, rows, short, console)
             left_out += [head for head in gave_way if head not in left_out]
             console.print(grid)
+    if len(verdicts) > MANY and all(verdict.word == "cannot tell" for verdict in verdicts):
+        two = " ".join(entry.address for entry in entries[:2])
+        console.print(f"Fewer at once may be told apart, for example: demobench compare {escape(two)}", soft_wrap=True)
     narrow = [f"left out for want of width: {', '.join(left_out)} (all in --json)"] if left_out else []
     notes = [line for line in _footnotes(verdicts, family, entries) if line.split(":")[0] not in left_out]
     for line in (*notes, *narrow):
@@ -410,6 +419,8 @@ NUMBERS: dict[str, Callable[["Comparison"], str]] = {
 """The columns of numbers; those of `GIVE_WAY` are left out, in this order, where the console is too narrow. The verdict's
 words say how large a difference is, but not how sure: p stays longest."""
 GIVE_WAY = ("visible from", "95 %", "a − b", "p, Holm")
+MANY = 6
+"""More pairs than this that all end in the same words are one line."""
 
 
 def _footnotes(verdicts: Sequence["Comparison"], family: int, entries: Sequence[Entry]) -> list[str]:

@@ -1,19 +1,24 @@
 """`demobench compare` on a store whose errors are made by hand, so that every verdict is known beforehand."""
 
+import io
 import json
 import sys
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rich.console import Console
 from safetensors.numpy import save_file
 
 from assets_defs.plan import Plan, Unit
 from demobench.cli import main
-from demobench.commands.compare import compare_policies, compare_rollouts, parse_address
+from demobench.commands.compare import compare_policies, compare_rollouts, parse_address, show_verdicts
 from pipeline.config import load_config
 from pipeline.errors import ConfigError, StoreError
 from pipeline.experiment import from_config
 from pipeline.simulate.trial import save_rollouts
+from pipeline.statistics.comparisons import Comparison
 from pipeline.store import Made, Store
 from pipeline.types import EpisodeErrors, Rollouts
 
@@ -260,3 +265,30 @@ def test_from_the_command_line(place, capsys, monkeypatch):
     shown = capsys.readouterr()
     assert left.value.code == 2
     assert shown.err.count("error:") == 1
+
+
+def test_pairs_that_all_end_in_the_same_words_are_one_line():
+    missing = "needs at least 12 held-out episodes: with fewer nothing can show among 8 comparisons"
+    numbers = (0.1, (-1.0, 1.0), 0.4, 1.0, 0.5, 12, missing)
+    pairs = [
+        Comparison(f"tape/p{i}/state", f"tape/p{i + 1}/state", "first_step_mae", "cannot tell", *numbers)
+        for i in range(8)
+    ]
+    entries = [
+        SimpleNamespace(
+            address=f"tape/p{i}/state", key="tape", policy=f"p{i}", observations="state", unit="px", is_elsewhere=False
+        )
+        for i in range(9)
+    ]
+
+    def shown(verdicts) -> str:
+        console = Console(width=200, file=io.StringIO())
+        show_verdicts(verdicts, 8, entries, console)
+        return console.file.getvalue()
+
+    all_alike = shown(pairs)
+    assert f"first step, MAE, px: all 8 pairs: cannot tell: {missing}" in all_alike
+    assert "for example: demobench compare tape/p0/state tape/p1/state" in all_alike
+    one_stands_out = shown([*pairs[:7], replace(pairs[7], word="better", words="error 40 % lower")])
+    assert one_stands_out.count(missing) == 7
+    assert "for example" not in one_stands_out
