@@ -121,11 +121,14 @@ def compare_policies(
 
 
 def parse_address(text: str) -> Address:
-    """Split an address.
+    """Split an address; a folder stands for the data set of its name.
 
     Raises:
         ConfigError: it is none.
     """
+    folder = Path(text).expanduser()
+    if folder.is_dir():
+        return Address(text, folder.absolute().name, None, None, None)
     body, at, pin = text.partition("@")
     parts = body.split("/")
     if not 1 <= len(parts) <= 3 or not all(parts) or (at and not pin) or (pin and len(parts) == 1):

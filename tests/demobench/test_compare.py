@@ -212,7 +212,9 @@ def test_mistakes_are_answered(place, addresses, kind, words):
         place.compare(*addresses)
 
 
-def test_addresses_are_read_as_people_write_them():
+def test_addresses_are_read_as_people_write_them(tmp_path):
+    (tmp_path / "tape").mkdir()
+    assert parse_address(str(tmp_path / "tape")).dataset == "tape"
     found = parse_address("tape+notebook/mlp_k16/pose@1f3a")
     assert (found.dataset, found.policy, found.observations, found.pin) == ("tape+notebook", "mlp_k16", "pose", "1f3a")
     assert parse_address("tape").policy is None
