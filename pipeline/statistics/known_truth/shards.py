@@ -107,7 +107,7 @@ def plan(size: Size) -> list[Shard]:
     for resampled in (True, False) if full else (True,):
         for seeds in (5, 1) if full else (5,):
             add("null", 400 if full else 60, 20, generator="arm", episodes=50, seeds=seeds, resampled=resampled)
-    floors = {300: 40, 200: 40, 100: 200, 50: 200, 20: 10} if full else {100: 30, 50: 30, 20: 2}
+    floors = {300: 40, 200: 40, 100: 200, 50: 200, 20: 10} if full else {100: 20, 50: 30, 20: 2}
     for episodes, repeats in floors.items():
         for generator in GENERATORS:
             add("floors", repeats, 20 if episodes > 150 else 50, generator=generator, episodes=episodes)
