@@ -10,9 +10,9 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from demobench.commands.session import Session, open_session, write_json_to
+from demobench.commands.session import Session, open_session, stored_plan, write_json_to
 from pipeline.errors import ConfigError, StoreError, did_you_mean
-from pipeline.experiment import Choices, Variant, known_as, no_such_dataset, resolve_target
+from pipeline.experiment import Variant
 from pipeline.methods import EXTERNAL
 
 if TYPE_CHECKING:
@@ -142,17 +142,7 @@ def parse_address(text: str) -> Address:
 
 def _entries(address: Address, session: Session) -> list[Entry]:
     """The up-to-date results that an address names."""
-    from assets_defs.plan import Plan
-
-    registered = session.store.experiments()
-    dataset = known_as(address.dataset, session.config, registered)
-    if dataset not in registered and dataset not in session.config.datasets:
-        raise no_such_dataset(dataset, {*registered, *session.config.datasets})
-    target = resolve_target(dataset, session.config, session.config_dir, Choices(), registered)
-    # Two results of the store can be compared although their source has moved since: the data hash says what they are of.
-    plan = Plan(
-        session.store, target.key, target.experiment, tuple(target.experiment.variants), look_at_source=False
-    )  # fmt: skip
+    plan = stored_plan(address.dataset, session)
     fresh = [
         (variant, unit.entry)
         for variant in plan.variants
@@ -165,8 +155,8 @@ def _entries(address: Address, session: Session) -> list[Entry]:
         stale = any(session.store.made(plan.folder(unit)) for unit in units)
         why = " (those there are of other data, settings or an older demobench)" if stale else ""
         raise StoreError(
-            f"There are no up-to-date results of '{target.key}' in {session.store.root}{why}. Make them with: demobench run "
-            f"{target.key}"
+            f"There are no up-to-date results of '{plan.key}' in {session.store.root}{why}. Make them with: demobench run "
+            f"{plan.key}"
         )
     chosen = [_choose(address, fresh, plan)] if address.policy else fresh
     entries = [_load(plan, variant, observations) for variant, observations in chosen]

@@ -8,14 +8,17 @@ import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from pipeline.config import Config, find_config, load_config
 from pipeline.errors import StoreError
-from pipeline.experiment import Choices, Target, resolve_target
+from pipeline.experiment import Choices, Target, known_as, no_such_dataset, resolve_target
 from pipeline.store import Store, write_json
+
+if TYPE_CHECKING:
+    from assets_defs.plan import Plan
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,25 @@ def open_dataset(argument: str, session: Session, choices: Choices | None = None
     registered = session.store.experiments()
     target = resolve_target(argument, session.config, session.config_dir, choices or Choices(), registered)
     return target, *load_experiment(target.experiment, session.config_dir)
+
+
+def stored_plan(name: str, session: Session) -> "Plan":
+    """The results in the store of the data set that goes by a name.
+
+    The source is not looked at: results can be used although it has moved since; the data hash says what they are of.
+
+    Raises:
+        ConfigError: there is no such data set, or the name means several.
+    """
+    from assets_defs.plan import Plan
+
+    registered = session.store.experiments()
+    dataset = known_as(name, session.config, registered)
+    if dataset not in registered and dataset not in session.config.datasets:
+        raise no_such_dataset(dataset, {*registered, *session.config.datasets})
+    target = resolve_target(dataset, session.config, session.config_dir, Choices(), registered)
+    variants = tuple(target.experiment.variants)
+    return Plan(session.store, target.key, target.experiment, variants, look_at_source=False)
 
 
 def program(name: str) -> str:

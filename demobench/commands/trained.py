@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from demobench.commands.compare import Address, parse_address
-from demobench.commands.session import Session
+from demobench.commands.session import Session, stored_plan
 from pipeline.errors import ConfigError, StoreError, did_you_mean
-from pipeline.experiment import Choices, Variant, known_as, no_such_dataset, resolve_target
+from pipeline.experiment import Variant
 
 if TYPE_CHECKING:
     from assets_defs.plan import Plan
@@ -39,25 +39,16 @@ def find_trained(text: str, session: Session) -> list[Found]:
     ConfigError : it names nothing that is trained, or one of several observation sets is meant.
     StoreError : what it names was not trained yet, or its weights are out of date.
     """
-    from assets_defs.plan import Plan
-
     address = parse_address(text)
     if address.policy is None or address.pin is not None:
         raise ConfigError(
             f"'{text}' names no policy. Expected dataset/policy[/observations], for example tape/mlp_k16."
         )
-    registered = session.store.experiments()
-    dataset = known_as(address.dataset, session.config, registered)
-    if dataset not in registered and dataset not in session.config.datasets:
-        raise no_such_dataset(dataset, {*registered, *session.config.datasets})
-    target = resolve_target(dataset, session.config, session.config_dir, Choices(), registered)
-    plan = Plan(
-        session.store, target.key, target.experiment, tuple(target.experiment.variants), look_at_source=False
-    )  # fmt: skip
+    plan = stored_plan(address.dataset, session)
     variants = [v for v in plan.variants if address.policy in (v.name, v.family)]
     if not variants:
         known = {name for v in plan.variants if v.is_trained for name in (v.name, v.family)}
-        raise ConfigError(f"'{dataset}' has no policy '{address.policy}'. {did_you_mean(address.policy, known)}")
+        raise ConfigError(f"'{plan.key}' has no policy '{address.policy}'. {did_you_mean(address.policy, known)}")
     if not variants[0].is_trained:
         raise ConfigError(f"'{address.policy}' is a baseline: nothing of it is trained, and it is not rolled out.")
     return _load(plan, variants, _the_set(address, plan, variants[0]))
