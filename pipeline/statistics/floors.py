@@ -213,7 +213,10 @@ def _estimate(states: States, found: Neighbours, everywhere: Neighbours, horizon
     pairs, difference = _pairs(states, found), _differences(states, pilot, found, horizon)
     squared = difference**2
     recorded = 0.5 * (_recorded(states, found, horizon) ** 2).mean(axis=2)
-    jump = _jump(states, pilot, everywhere, horizon)
+    at_all = (pairs, difference)
+    if everywhere is not found:
+        at_all = _pairs(states, everywhere), _differences(states, pilot, everywhere, horizon)
+    jump = _jump(*at_all)
     doubt = _doubt(states, pilot, pairs, 0.5 * squared.mean(axis=2), recorded, jump)
     estimates = [_judge(states, pairs, horizon, "rmse", 0.5 * squared.mean(axis=2), doubt)]
     doubt = doubt if doubt.by_pilot else Doubt()  # a bracket of a factor of two has room for a jump
@@ -408,14 +411,13 @@ def _doubt(states: States, pilot: Pilot, pairs: Pairs, apart: np.ndarray, record
     return Doubt(explained, max(0.0, jump.value))
 
 
-def _jump(states: States, pilot: Pilot, found: Neighbours, horizon: int) -> Sum:
+def _jump(pairs: Pairs, difference: np.ndarray) -> Sum:
     """How much of the floor's square may be a jump in the mean of one action column rather than disagreement.
 
     Where a mean is smooth, values grow with the squared distance. Where it jumps (a gripper that closes), they grow with the
     distance itself, and a straight line in its square ends too high, by once or twice what the two laws' intercepts lie
     apart. The pilot takes smooth growth away, so what grows still is suspect.
     """
-    pairs, difference = _pairs(states, found), _differences(states, pilot, found, horizon)
     there = pairs.curve[np.isfinite(pairs.curve)]  # far ahead, fewer episodes than that have an action
     weights = np.pad(_line(there) - _line(np.sqrt(there)), (0, len(pairs.curve) - len(there)))
     columns = [
