@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serial
 
 from pipeline.errors import ConfigError, did_you_mean
 from pipeline.execution import settled
-from pipeline.methods import DERIVED, METHODS, SYMMETRIES, is_own
+from pipeline.methods import DERIVED, HINDSIGHT, METHODS, SYMMETRIES, is_own
 from pipeline.settings import SETTINGS, settings_of
 from pipeline.types import AS_USUAL, ActionKind, ColumnChoice, Execution, Protocol
 
@@ -158,10 +158,12 @@ class AugmentConfig(Settings):
 
     noise     on what is seen: a share of each column's deviation, or by unit or column name
     symmetry  of the data set, by name; each window of a batch is turned by it or not, by chance
+    hindsight  by name: training episodes are told as if they had ended where they should
     """
 
     noise: Annotated[float, Field(ge=0)] | dict[str, Annotated[float, Field(ge=0)]] = 0.0
     symmetry: str | None = None
+    hindsight: str | None = None
 
 
 class PolicyConfig(Settings):
@@ -202,7 +204,8 @@ class PolicyConfig(Settings):
         """What of the keys that not every method takes is used, by the name under which methods list it."""
         used = {key: getattr(self, key) for key in ("history", "features", "steps", "cpu_seconds")}
         used |= {"actions": None if self.actions == "absolute" else self.actions}
-        used |= {"noise": self.augment.noise or None, "symmetry": self.augment.symmetry}
+        augment = self.augment
+        used |= {"noise": augment.noise or None, "symmetry": augment.symmetry, "hindsight": augment.hindsight}
         return {key: value for key, value in used.items() if value is not None}
 
     @property
@@ -213,7 +216,8 @@ class PolicyConfig(Settings):
     @property
     def view(self) -> dict[str, Any]:
         """What of that its transform and augmentation are made from."""
-        return {key: value for key, value in self.given.items() if key in ("actions", "features", "noise", "symmetry")}
+        keys = ("actions", "features", "noise", "symmetry", "hindsight")
+        return {key: value for key, value in self.given.items() if key in keys}
 
 
 class ScheduleConfig(Settings):
@@ -344,7 +348,7 @@ def check_policy(policy: PolicyConfig) -> None:
     _check_execution(policy)
     for key in policy.given:
         if key not in takes:
-            place = f"augment.{key}" if key in ("noise", "symmetry") else key
+            place = f"augment.{key}" if key in AugmentConfig.model_fields else key
             raise ConfigError(
                 f"{place} is not for the method '{policy.method}'. It takes {', '.join(sorted(takes)) or 'nothing of the kind'}."
             )
@@ -355,9 +359,10 @@ def check_policy(policy: PolicyConfig) -> None:
             f"features '{policy.features}' do not exist. {did_you_mean(policy.features, DERIVED)} "
             'A function of your own is named by its file: features = "my_features.py:function".'
         )
-    if policy.augment.symmetry is not None and policy.augment.symmetry not in SYMMETRIES:
-        known = did_you_mean(policy.augment.symmetry, SYMMETRIES)
-        raise ConfigError(f"augment.symmetry '{policy.augment.symmetry}' does not exist. {known}")
+    for key, there_are in (("symmetry", SYMMETRIES), ("hindsight", HINDSIGHT)):
+        asked = getattr(policy.augment, key)
+        if asked is not None and asked not in there_are:
+            raise ConfigError(f"augment.{key} '{asked}' does not exist. {did_you_mean(asked, there_are)}")
     if policy.method in SETTINGS:
         settings_of(policy.method, policy.settings)
     elif policy.settings and not is_own(policy.method):

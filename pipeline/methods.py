@@ -1,5 +1,5 @@
 """The methods there are: from a name to where a method lives and what a benchmark must know of it; likewise the derived
-features and symmetries that policies can be given by name.
+features, symmetries and goals that policies can be given by name.
 
 What belongs here: what may be asked about a method without importing torch. What does not: the methods (`policies`), what each is
 made with (`settings`).
@@ -46,8 +46,8 @@ class Method:
         return found if self.address is None else found(self.address)
 
 
-TRANSFORM = frozenset({"history", "actions", "features", "symmetry"})
-"""What concerns only what a policy sees and answers."""
+TRANSFORM = frozenset({"history", "actions", "features", "symmetry", "hindsight"})
+"""What concerns only what a policy sees and answers, and what it is shown."""
 BUDGET = frozenset({"steps", "cpu_seconds"})
 NETWORK = TRANSFORM | BUDGET | {"noise"}
 HISTORY = frozenset({"history"})
@@ -95,7 +95,12 @@ METHODS = Methods(
         "diffusion": Method("pipeline.policies.diffusion", "Diffusion", chunk="set", trained=True, takes=NETWORK),
         "act": Method("pipeline.policies.act", "Act", chunk="set", trained=True, takes=NETWORK),
         "image": Method(
-            "pipeline.policies.image", "Image", chunk="set", trained=True, takes=NETWORK - {"symmetry"}, camera=True
+            "pipeline.policies.image",
+            "Image",
+            chunk="set",
+            trained=True,
+            takes=NETWORK - {"symmetry", "hindsight"},
+            camera=True,
         ),
         "notebook_pusht": Method(
             "pipeline.policies.notebook_pusht", "NotebookPushT", chunk="one", trained=True, recipe="every_frame"
@@ -103,8 +108,17 @@ METHODS = Methods(
     }
 )
 
-DERIVED = {"pusht_block_frame": ("pipeline.policies.pusht_views", "block_frame")}
+DERIVED = {
+    "pusht_block_frame": ("pipeline.policies.pusht_views", "block_frame"),
+    "so101_hand_frame": ("pipeline.policies.so101_views", "hand_frame"),
+}
 """Functions that derive features from what is seen: name → module and function (`policies.transform` says what they get)."""
 
-SYMMETRIES = {"pusht_mirror": ("pipeline.policies.pusht_views", "mirror")}
+SYMMETRIES = {
+    "pusht_mirror": ("pipeline.policies.pusht_views", "mirror"),
+    "so101_pan": ("pipeline.policies.so101_views", "turn"),
+}
 """A data set's own symmetries, likewise."""
+
+HINDSIGHT = {"pusht_goal": ("pipeline.policies.pusht_views", "end_at_goal")}
+"""How episodes are told as if they had ended where they should, likewise."""

@@ -19,7 +19,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from pipeline.policies import Curve, Plan
-from pipeline.policies.transform import Transform, apply_symmetry, fit_transform
+from pipeline.policies.augmentation import apply_symmetry, in_hindsight
+from pipeline.policies.transform import Transform, fit_transform
 from pipeline.settings import settings_of
 from pipeline.types import ACTION, Observations
 from pipeline.windows import Windows, rows
@@ -64,7 +65,8 @@ class Lwr:
         """
         began = time.perf_counter()
         settings = settings_of("lwr", plan.settings)
-        given = {key: value for key, value in plan.given.items() if key != "symmetry"}
+        windows = in_hindsight(windows, plan.given.get("hindsight"))
+        given = {key: plan.given[key] for key in ("actions", "features") if key in plan.given}
         policy, episode = _remember(cls, windows, fit_transform(windows, **given), plan)
         policy = replace(policy, neighbours=settings.neighbours, ridge=settings.ridge)
         if not (settings.neighbours and settings.ridge):
@@ -175,8 +177,11 @@ def _remember(cls: type[Lwr], windows: Windows, transform: Transform, plan: Plan
     parts = [(windows.observations().values, actions)]
     if symmetry is not None:
         widths = transform.widths
-        turned = apply_symmetry(symmetry, widths, parts[0][0], windows.targets()[0])[0]
-        parts.append((turned, apply_symmetry(symmetry, widths, windows.values[:, None], actions[:, None])[1][:, 0]))
+        # An episode is turned as a whole, so that the actions of its frames belong together.
+        amount = np.random.default_rng(0).random(demos.episodes)[demos.episode_of_frame]
+        turned = apply_symmetry(symmetry, widths, parts[0][0], windows.targets()[0], amount[windows.anchors])[0]
+        every = apply_symmetry(symmetry, widths, windows.values[:, None], actions[:, None], amount)
+        parts.append((turned, every[1][:, 0]))
     kept = np.concatenate([np.arange(demos.frames)[demos.episode(e)] for e in windows.episodes])
     row = np.full(demos.frames, -1, np.int64)
     row[kept] = np.arange(len(kept))

@@ -19,8 +19,9 @@ import torch
 from torch import nn
 
 from pipeline.policies import Curve, Plan
+from pipeline.policies.augmentation import Augment, fit_augment, in_hindsight
 from pipeline.policies.fitting import Batches, Training, device_named, fingerprint, settle_steps, threads
-from pipeline.policies.transform import Augment, Transform, fit_augment, fit_transform
+from pipeline.policies.transform import Transform, fit_transform
 from pipeline.settings import SETTINGS, MethodSettings, TrainingSettings, settings_of
 from pipeline.types import Observations
 from pipeline.windows import Windows
@@ -131,6 +132,7 @@ class NetworkPolicy:
         StoreError : a checkpoint cannot be written.
         """
         settings = settings_of(cls.method, plan.settings)
+        windows = in_hindsight(windows, plan.given.get("hindsight"))
         transform = fit_transform(windows, **_of(plan.given, "actions", "features"))
         augment = fit_augment(windows, **_of(plan.given, "noise", "symmetry"))
         sampler = Sampler(windows, transform, augment, partial(cls.see, settings, transform))

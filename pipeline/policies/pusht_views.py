@@ -1,12 +1,13 @@
-"""PushT seen from the block, and PushT in the mirror: what its policies can be given by name.
+"""PushT seen from the block, in the mirror, and in hindsight: what its policies can be given by name.
 
-What belongs here: derived features and symmetries of that one task, in px of its 512 × 512 table. What does not: scaling
+What belongs here: derived features, symmetries and goals of that one task, in px of its 512 × 512 table. What does not: scaling
 (`transform`), physics (`simulate`).
 """
 
 import numpy as np
 
-from pipeline.types import STATE
+from pipeline.lerobot_format.kinds import wrap
+from pipeline.types import ACTION, STATE
 
 BLOCK = "observation.environment_state"
 TABLE_PX = 512.0
@@ -52,10 +53,10 @@ def _corners(block: np.ndarray) -> np.ndarray:
     return block[..., None, :2] + turned
 
 
-def mirror(seen, actions):
+def mirror(seen, actions, amount):
     """The table in the mirror that maps target and T onto themselves: (x, y) → (512 − y, 512 − x), θ → π/2 − θ.
 
-    Its own inverse, up to whole turns.
+    Its own inverse, up to whole turns; a mirror turns by no `amount`.
     """
     if {seen[STATE].shape[-1], actions.shape[-1], seen.get(BLOCK, np.empty(3)).shape[-1] - 1} != {2}:
         raise ValueError("it turns x and y of the agent and of its target, and x, y and angle of the block.")
@@ -65,6 +66,33 @@ def mirror(seen, actions):
         angle = (np.pi / 2 - block[..., 2:]) % (2 * np.pi)
         mirrored[BLOCK] = np.concatenate([_swap(block[..., :2]), angle], axis=-1).astype(block.dtype)
     return mirrored, _swap(actions)
+
+
+def end_at_goal(recorded):
+    """[N, 2] agent, [N, 3] block, [N, 2] action → the episode moved and turned on the table until the block ends on its target.
+
+    The last action's effect was not recorded: the block is taken to move on in it as in the frame before. People stop a little
+    beside the target, on every side of it; told like this, they show how the last pushes get there. The table's edges move
+    along, by some px.
+    """
+    if (recorded[STATE].shape[-1], recorded[ACTION].shape[-1], recorded[BLOCK].shape[-1]) != (2, 2, 3):
+        raise ValueError("it moves x and y of the agent and of its target, and x, y and angle of the block.")
+    block = recorded[BLOCK].astype(np.float64)
+    moved = block[-1] - block[max(len(block) - 2, 0)]
+    end = block[-1] + [moved[0], moved[1], wrap(moved[2])]
+    turn = TARGET[2] - end[2]
+    cos, sin = np.cos(turn), np.sin(turn)
+    rotation = np.array([[cos, sin], [-sin, cos]])
+
+    def carried(points):
+        return (points - end[:2]) @ rotation + TARGET[:2]
+
+    angle = (block[:, 2:] + turn) % (2 * np.pi)
+    return {
+        STATE: carried(recorded[STATE]),
+        ACTION: carried(recorded[ACTION]),
+        BLOCK: np.concatenate([carried(block[:, :2]), angle], axis=1),
+    }
 
 
 def _swap(points: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""A policy's own view of its windows: what enters a method, what its answers mean, and how training windows are varied.
+"""A policy's own view of its windows: what enters a method, and what its answers mean.
 
-What belongs here: scaling, relative actions, derived features with their inverses; augmentation. What does not: which windows
-there are (`windows`), learning (`networks`).
+What belongs here: scaling, relative actions, derived features with their inverses. What does not: which windows there are
+(`windows`), how they are varied in training (`augmentation`), learning (`networks`).
 
     inputs   [B, F]  the set's columns, scaled, frame after frame, then derived features, scaled
     targets  [B, K, A']  absolute columns as the normaliser encodes them, after them those relative to the state at the anchor
@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import ConfigError, PolicyError, did_you_mean
+from pipeline.errors import PolicyError
 from pipeline.lerobot_format.kinds import wrap
 from pipeline.lerobot_format.quality import dead_columns
-from pipeline.methods import DERIVED, SYMMETRIES
+from pipeline.methods import DERIVED
 from pipeline.normalize import Normalizer, Scaler, check_columns, circular_columns, fit_scaler, frames_of
 from pipeline.types import ACTION, STATE
 from pipeline.windows import Windows
@@ -102,7 +102,7 @@ class Transform:
         """[B, R] the state that relative columns are relative to."""
         if not self.relative.any():
             return np.empty((len(values), 0))
-        state = _split(self.widths, values)[STATE]
+        state = split_columns(self.widths, values)[STATE]
         return state[:, -1, self.state_column[self.relative]].astype(np.float64)
 
     def encode_actions(self, actions: np.ndarray, now: np.ndarray) -> np.ndarray:
@@ -220,7 +220,7 @@ def _rms(
     squares, counts = np.zeros((windows.chunk, int(relative.sum()))), np.zeros((windows.chunk, 1))
     if relative.any():
         for values, actions, mask in _all(windows):
-            now = _split(widths, values)[STATE][:, -1, state_column[relative]].astype(np.float64)
+            now = split_columns(widths, values)[STATE][:, -1, state_column[relative]].astype(np.float64)
             moved = _moved(actions, now, relative, circular)
             squares += (moved**2 * mask[..., None]).sum(axis=0)
             counts[:, 0] += mask.sum(axis=0)
@@ -243,7 +243,8 @@ def _all(windows: Windows):
         yield windows.observations(block).values, *windows.targets(block)
 
 
-def _split(widths: Mapping[str, int], values: np.ndarray) -> dict[str, np.ndarray]:
+def split_columns(widths: Mapping[str, int], values: np.ndarray) -> dict[str, np.ndarray]:
+    """[..., O] → feature key → [..., D]."""
     parts = np.split(values, np.cumsum(list(widths.values()))[:-1], axis=-1)
     return dict(zip(widths, parts, strict=True))
 
@@ -258,7 +259,7 @@ def derive(name: str, widths: Mapping[str, int], values: np.ndarray) -> np.ndarr
         PolicyError: it needs what is not seen, fails, or answers with something else than B rows of finite numbers.
     """
     function = find_function(name)
-    shown = Seen(_split(widths, values), f"The derived features '{name}'")
+    shown = Seen(split_columns(widths, values), f"The derived features '{name}'")
     try:
         found = np.asarray(function(shown), np.float64)
     except PolicyError:
@@ -304,96 +305,3 @@ def _import_function(address: str, content: str) -> Callable[[Mapping[str, np.nd
     if not callable(function):
         raise PolicyError(f"features = \"{address}\": {where} has no function '{name}'.")
     return function
-
-
-# Augmentation -----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Augment:
-    """How training windows are varied: `noise` [O] added to every frame, in raw units; a symmetry applied or not, by chance.
-
-    A noisy window keeps its recorded actions: a policy that is a little off, or sees a little wrong, is to do what was right.
-    """
-
-    widths: Mapping[str, int]
-    noise: np.ndarray
-    symmetry: str | None
-
-    def __call__(
-        self, values: np.ndarray, actions: np.ndarray, generator: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """[B, T, O], [B, K, A] → the same, varied."""
-        if self.symmetry is not None:
-            turned = generator.random(len(values)) < 0.5
-            values, actions = values.copy(), actions.copy()
-            values[turned], actions[turned] = apply_symmetry(
-                self.symmetry, self.widths, values[turned], actions[turned]
-            )
-        if self.noise.any():
-            drawn = generator.standard_normal(values.shape, np.float32)
-            values = values + drawn * self.noise.astype(np.float32)
-        return values, actions
-
-
-def fit_augment(
-    windows: Windows, *, noise: float | Mapping[str, float] | None = None, symmetry: str | None = None
-) -> Augment | None:
-    """None where nothing is varied.
-
-    Raises:
-        PolicyError: noise is named for a unit or column that the set lacks, or the symmetry is of other data.
-    """
-    if not noise and symmetry is None:
-        return None
-    widths = {key: windows.demos.columns[key].shape[1] for key in windows.observation_set.features}
-    if symmetry is not None:
-        few = slice(0, min(8, len(windows)))
-        apply_symmetry(symmetry, widths, windows.observations(few).values, windows.targets(few)[0])
-    return Augment(widths, _noise(windows, noise or 0.0), symmetry)
-
-
-def _noise(windows: Windows, noise: float | Mapping[str, float]) -> np.ndarray:
-    """[O] in raw units."""
-    features = [windows.demos.features[key] for key in windows.observation_set.features]
-    names, units = ([x for f in features for x in getattr(f, part)] for part in ("names", "units"))
-    if not isinstance(noise, Mapping):
-        return noise * windows.normalizer.observations.scale[: len(names)]
-    for word in noise:
-        if word not in (*names, *units):
-            known = did_you_mean(word, {*names, *(unit for unit in units if unit)})
-            raise PolicyError(
-                f"augment.noise is given for '{word}', which is neither a column nor a unit of the observation set "
-                f"'{windows.observation_set.name}'. {known}"
-            )
-    return np.array([noise.get(name, noise.get(unit, 0.0)) for name, unit in zip(names, units, strict=True)])
-
-
-def apply_symmetry(
-    name: str, widths: Mapping[str, int], values: np.ndarray, actions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Windows in a data set's own mirror, observations and actions together.
-
-    Raises:
-        ConfigError: there is no symmetry of that name.
-        PolicyError: it is of other data than these.
-    """
-    if name not in SYMMETRIES:
-        raise ConfigError(f"augment.symmetry '{name}' does not exist. {did_you_mean(name, SYMMETRIES)}")
-    module, function = SYMMETRIES[name]
-    seen = Seen(_split(widths, values), f"What the symmetry '{name}' turns")
-    try:
-        turned, answered = getattr(import_module(module), function)(seen, actions)
-    except (IndexError, ValueError) as error:
-        raise PolicyError(f"The symmetry '{name}' does not fit this data: {error}") from error
-    missing = [key for key in widths if key not in turned]
-    if missing:
-        raise PolicyError(
-            f"The symmetry '{name}' does not say what becomes of '{missing[0]}'. Leave it out of the set."
-        )
-    parts = [turned[key] for key in widths]
-    if answered.shape != actions.shape or any(
-        part.shape[-1] != widths[key] for key, part in zip(widths, parts, strict=True)
-    ):
-        raise PolicyError(f"The symmetry '{name}' does not fit this data: it is of other columns than these.")
-    return np.concatenate(parts, axis=-1).astype(values.dtype), answered

@@ -1,13 +1,13 @@
-"""A policy's own view: what is encoded is decoded, relative actions, derived features, noise and symmetry on tiny arrays."""
+"""A policy's own view: what is encoded is decoded, relative actions and derived features on tiny arrays."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError, PolicyError
-from pipeline.policies.pusht_views import BLOCK, CORNERS, block_frame, mirror
-from pipeline.policies.transform import Transform, apply_symmetry, derive, fit_augment, fit_transform
+from pipeline.errors import PolicyError
+from pipeline.policies.pusht_views import BLOCK, CORNERS, block_frame
+from pipeline.policies.transform import Transform, derive, fit_transform
 from pipeline.types import ACTION, STATE, ObservationSet
 from pipeline.windows import make_windows
 from tests.hand_made import POSE, STATE_ONLY, demonstrations, random_walks, semantics
@@ -213,75 +213,3 @@ def test_mistakes_in_it_are_one_message(own, name, words):
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(PolicyError, match='features = ".*": there is no file'):
         fit_transform(lay(random_walks()), features=f"{tmp_path}/nowhere.py:f")
-
-
-# Augmentation -----------------------------------------------------------------------------------------------------------
-
-
-def test_the_mirror_is_its_own_inverse_and_keeps_target_and_shape():
-    demos, _ = pusht()
-    seen = {STATE: demos.columns[STATE][:, None], BLOCK: demos.columns[POSE][:, None]}
-    actions = demos.columns[ACTION][:, None]
-    once, acted = mirror(seen, actions)
-    twice, acted_twice = mirror(once, acted)
-    np.testing.assert_allclose(acted_twice, actions, atol=1e-3)
-    np.testing.assert_allclose(twice[STATE], seen[STATE], atol=1e-3)
-    np.testing.assert_allclose(twice[BLOCK][..., :2], seen[BLOCK][..., :2], atol=1e-3)
-    np.testing.assert_allclose(np.cos(twice[BLOCK][..., 2] - seen[BLOCK][..., 2]), 1, atol=1e-5)
-    target = {STATE: np.zeros((1, 1, 2)), BLOCK: np.array([[[256.0, 256.0, np.pi / 4]]])}
-    np.testing.assert_allclose(mirror(target, np.zeros((1, 1, 2)))[0][BLOCK], target[BLOCK])
-
-
-def test_the_mirror_turns_the_table_as_one():
-    """Seen from the block nothing changes but the side: distances along it stay, those across change their sign."""
-    demos, _ = pusht()
-    seen = {STATE: demos.columns[STATE][:, None], BLOCK: demos.columns[POSE][:, None]}
-    before, after = block_frame(seen), block_frame(mirror(seen, demos.columns[ACTION][:, None])[0])
-    np.testing.assert_allclose(after[:, 16], -before[:, 16], atol=1e-3)
-    np.testing.assert_allclose(after[:, 17], before[:, 17], atol=1e-3)
-    mirrored_corners = 512 - before[:, :16].reshape(-1, 8, 2)[:, [1, 0, 7, 6, 5, 4, 3, 2], ::-1]
-    np.testing.assert_allclose(after[:, :16].reshape(-1, 8, 2), mirrored_corners, atol=1e-3)
-
-
-def test_about_half_of_a_batch_is_mirrored_with_its_actions():
-    demos, meaning = pusht(40, 4)
-    windows = lay(demos, meaning, WITH_POSE)
-    augment = fit_augment(windows, symmetry="pusht_mirror")
-    values, (actions, _) = windows.observations().values, windows.targets()
-    seen, acted = augment(values, actions, np.random.default_rng(0))
-    turned = (seen != values).any(axis=(1, 2))
-    assert 0.35 < turned.mean() < 0.65
-    np.testing.assert_array_equal((acted != actions).any(axis=(1, 2)), turned)
-    mirrored, answered = apply_symmetry("pusht_mirror", augment.widths, values, actions)
-    np.testing.assert_array_equal(seen, np.where(turned[:, None, None], mirrored, values))
-    np.testing.assert_array_equal(acted, np.where(turned[:, None, None], answered, actions))
-
-
-def test_noise_by_unit_and_by_share_of_the_deviation():
-    demos, meaning = pusht(60, 5)
-    windows = lay(demos, meaning, WITH_POSE)
-    values, (actions, _) = windows.observations().values, windows.targets()
-    for noise, expected in (({"px": 1.0, "rad": 0.02}, [1, 1, 1, 1, 0.02]), (0.1, None)):
-        seen, acted = fit_augment(windows, noise=noise)(values, actions, np.random.default_rng(0))
-        added = (seen - values).std(axis=(0, 1))
-        if expected is None:
-            expected = 0.1 * windows.normalizer.observations.scale[:5]
-        np.testing.assert_allclose(added, expected, rtol=0.12)
-        np.testing.assert_array_equal(acted, actions)
-    assert fit_augment(windows, noise={"o0": 3.0, "rad": 0.1}).noise.tolist() == [3, 0, 3, 0, 0.1]
-
-
-def test_what_does_not_fit_is_refused():
-    demos, meaning = pusht()
-    windows = lay(demos, meaning, WITH_POSE)
-    with pytest.raises(
-        PolicyError, match="'pixels', which is neither a column nor a unit .* Known: o0, o1, o2, px, rad"
-    ):
-        fit_augment(windows, noise={"pixels": 1.0})
-    with pytest.raises(ConfigError, match="'pusht_miror' does not exist. Did you mean 'pusht_mirror'"):
-        fit_augment(windows, symmetry="pusht_miror")
-    three = random_walks(columns=3)
-    with pytest.raises(PolicyError, match="symmetry 'pusht_mirror' does not fit this data: it turns x and y"):
-        fit_augment(lay(three), symmetry="pusht_mirror")
-    assert fit_augment(windows) is None
-    assert fit_augment(windows, noise=0.0) is None
