@@ -153,15 +153,20 @@ class DatasetConfig(Settings):
         return ColumnChoice(self.state, action, self.units, files, tuple(sorted(set(self.exclude))))
 
 
+Noise = Annotated[float, Field(ge=0)] | dict[str, Annotated[float, Field(ge=0)]]
+
+
 class AugmentConfig(Settings):
     """How training windows are varied.
 
-    noise     on what is seen: a share of each column's deviation, or by unit or column name
+    noise     on what is seen, anew in every frame: a share of each column's deviation, or by unit or column name
+    offset    likewise, but the same in all frames of a window
     symmetry  of the data set, by name; each window of a batch is turned by it or not, by chance
     hindsight  by name: training episodes are told as if they had ended where they should
     """
 
-    noise: Annotated[float, Field(ge=0)] | dict[str, Annotated[float, Field(ge=0)]] = 0.0
+    noise: Noise = 0.0
+    offset: Noise = 0.0
     symmetry: str | None = None
     hindsight: str | None = None
 
@@ -205,7 +210,12 @@ class PolicyConfig(Settings):
         used = {key: getattr(self, key) for key in ("history", "features", "steps", "cpu_seconds")}
         used |= {"actions": None if self.actions == "absolute" else self.actions}
         augment = self.augment
-        used |= {"noise": augment.noise or None, "symmetry": augment.symmetry, "hindsight": augment.hindsight}
+        used |= {
+            "noise": augment.noise or None,
+            "offset": augment.offset or None,
+            "symmetry": augment.symmetry,
+            "hindsight": augment.hindsight,
+        }
         return {key: value for key, value in used.items() if value is not None}
 
     @property
@@ -216,7 +226,7 @@ class PolicyConfig(Settings):
     @property
     def view(self) -> dict[str, Any]:
         """What of that its transform and augmentation are made from."""
-        keys = ("actions", "features", "noise", "symmetry", "hindsight")
+        keys = ("actions", "features", *AugmentConfig.model_fields)
         return {key: value for key, value in self.given.items() if key in keys}
 
 

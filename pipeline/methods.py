@@ -24,7 +24,7 @@ class Method:
     uses_observations  its answer depends on the observation set; else it runs once a data set
     frames             frames of `observation.state` that a method without an observation set looks at
     recipe             which windows it is made for (`windows.Recipe`)
-    takes              what it can be given by the configuration (`TRANSFORM`, `BUDGET`, "history", "noise")
+    takes              what it can be given by the configuration (`TRANSFORM`, `BUDGET`, `NETWORK`, "history")
     camera             it looks at a camera, beside the observation set
     address            of a class of the user's own, which `cls` then finds
     """
@@ -49,7 +49,7 @@ class Method:
 TRANSFORM = frozenset({"history", "actions", "features", "symmetry", "hindsight"})
 """What concerns only what a policy sees and answers, and what it is shown."""
 BUDGET = frozenset({"steps", "cpu_seconds"})
-NETWORK = TRANSFORM | BUDGET | {"noise"}
+NETWORK = TRANSFORM | BUDGET | {"noise", "offset"}
 HISTORY = frozenset({"history"})
 
 EXTERNAL = "external"

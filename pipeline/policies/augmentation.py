@@ -50,18 +50,25 @@ def in_hindsight(windows: Windows, name: str | None) -> Windows:
     return replace(windows, demos=replace(windows.demos, columns=dict(windows.demos.columns) | columns))
 
 
+Noise = float | Mapping[str, float]
+"""A share of each column's deviation, or in raw units by unit or column."""
+
+
 # Windows ----------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Augment:
-    """How training windows are varied: `noise` [O] added to every frame, in raw units; a symmetry applied or not, by chance.
+    """How training windows are varied: noise in raw units, and a symmetry applied or not, by chance.
 
     A noisy window keeps its recorded actions: a policy that is a little off, or sees a little wrong, is to do what was right.
+
+    noise   [O] deviation of what is added to every frame anew          offset  [O] of what is added to all frames of a window
     """
 
     widths: Mapping[str, int]
     noise: np.ndarray
+    offset: np.ndarray
     symmetry: str | None
 
     def __call__(
@@ -75,44 +82,45 @@ class Augment:
             values[turned], actions[turned] = apply_symmetry(
                 self.symmetry, self.widths, values[turned], actions[turned], amount
             )
-        if self.noise.any():
-            drawn = generator.standard_normal(values.shape, np.float32)
-            values = values + drawn * self.noise.astype(np.float32)
+        for deviation, frames in ((self.noise, values.shape[1]), (self.offset, 1)):
+            if deviation.any():
+                drawn = generator.standard_normal((len(values), frames, values.shape[2]), np.float32)
+                values = values + drawn * deviation.astype(np.float32)
         return values, actions
 
 
 def fit_augment(
-    windows: Windows, *, noise: float | Mapping[str, float] | None = None, symmetry: str | None = None
+    windows: Windows, *, noise: Noise | None = None, offset: Noise | None = None, symmetry: str | None = None
 ) -> Augment | None:
     """None where nothing is varied.
 
     Raises:
         PolicyError: noise is named for a unit or column that the set lacks, or the symmetry is of other data.
     """
-    if not noise and symmetry is None:
+    if not noise and not offset and symmetry is None:
         return None
     widths = {key: windows.demos.columns[key].shape[1] for key in windows.observation_set.features}
     if symmetry is not None:
         few = slice(0, min(8, len(windows)))
         values, actions = windows.observations(few).values, windows.targets(few)[0]
         apply_symmetry(symmetry, widths, values, actions, np.zeros(len(values)))
-    return Augment(widths, _noise(windows, noise or 0.0), symmetry)
+    return Augment(widths, _deviations(windows, "noise", noise), _deviations(windows, "offset", offset), symmetry)
 
 
-def _noise(windows: Windows, noise: float | Mapping[str, float]) -> np.ndarray:
+def _deviations(windows: Windows, key: str, given: Noise | None) -> np.ndarray:
     """[O] in raw units."""
     features = [windows.demos.features[key] for key in windows.observation_set.features]
     names, units = ([x for f in features for x in getattr(f, part)] for part in ("names", "units"))
-    if not isinstance(noise, Mapping):
-        return noise * windows.normalizer.observations.scale[: len(names)]
-    for word in noise:
+    if not isinstance(given, Mapping):
+        return (given or 0.0) * windows.normalizer.observations.scale[: len(names)]
+    for word in given:
         if word not in (*names, *units):
             known = did_you_mean(word, {*names, *(unit for unit in units if unit)})
             raise PolicyError(
-                f"augment.noise is given for '{word}', which is neither a column nor a unit of the observation set "
+                f"augment.{key} is given for '{word}', which is neither a column nor a unit of the observation set "
                 f"'{windows.observation_set.name}'. {known}"
             )
-    return np.array([noise.get(name, noise.get(unit, 0.0)) for name, unit in zip(names, units, strict=True)])
+    return np.array([given.get(name, given.get(unit, 0.0)) for name, unit in zip(names, units, strict=True)])
 
 
 def apply_symmetry(

@@ -134,7 +134,7 @@ class NetworkPolicy:
         settings = settings_of(cls.method, plan.settings)
         windows = in_hindsight(windows, plan.given.get("hindsight"))
         transform = fit_transform(windows, **_of(plan.given, "actions", "features"))
-        augment = fit_augment(windows, **_of(plan.given, "noise", "symmetry"))
+        augment = fit_augment(windows, **_of(plan.given, "noise", "offset", "symmetry"))
         sampler = Sampler(windows, transform, augment, partial(cls.see, settings, transform))
         shape = Shape(sampler.inputs, windows.history, windows.chunk, transform.width, sampler.limit())
 

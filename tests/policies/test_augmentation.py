@@ -8,6 +8,7 @@ from pipeline.lerobot_format.kinds import wrap
 from pipeline.policies.augmentation import apply_symmetry, fit_augment, in_hindsight
 from pipeline.policies.pusht_views import BLOCK, TARGET, block_frame, mirror
 from pipeline.policies.so101_views import hand_frame, turn
+from pipeline.policies.transform import fit_transform
 from pipeline.types import ACTION, STATE
 from pipeline.windows import make_windows
 from tests.hand_made import POSE, demonstrations, random_walks, semantics
@@ -130,6 +131,25 @@ def test_noise_by_unit_and_by_share_of_the_deviation():
         np.testing.assert_allclose(added, expected, rtol=0.12)
         np.testing.assert_array_equal(acted, actions)
     assert fit_augment(windows, noise={"o0": 3.0, "rad": 0.1}).noise.tolist() == [3, 0, 3, 0, 0.1]
+
+
+def test_an_offset_is_the_same_in_all_frames_and_is_taken_off_relative_answers():
+    demos, meaning = pusht(60, 5)
+    windows = lay(demos, meaning, WITH_POSE)
+    values, (actions, _) = windows.observations().values, windows.targets()
+    seen, acted = fit_augment(windows, offset={"px": 3.0})(values, actions, np.random.default_rng(0))
+    added = seen - values
+    np.testing.assert_allclose(added[:, 0], added[:, 1], atol=1e-4)
+    np.testing.assert_allclose(added[:, 0].std(axis=0), [3, 3, 3, 3, 0], rtol=0.12)
+    np.testing.assert_array_equal(acted, actions)
+    transform = fit_transform(windows, actions="relative")
+    before, after = (transform.encode_actions(actions, transform.now(v)) * transform.rms for v in (values, seen))
+    np.testing.assert_allclose(before - after, np.broadcast_to(added[:, :1, :2], before.shape), atol=1e-3)
+    both = fit_augment(windows, noise={"rad": 0.1}, offset={"px": 3.0})
+    assert both.noise.tolist() == [0, 0, 0, 0, 0.1]
+    assert both.offset.tolist() == [3, 3, 3, 3, 0]
+    with pytest.raises(PolicyError, match="augment.offset is given for 'mm'"):
+        fit_augment(windows, offset={"mm": 1.0})
 
 
 def test_what_does_not_fit_is_refused():
