@@ -121,7 +121,7 @@ def _rolled_out(bench: Bench, unit: Unit) -> dict:
     """What came of a policy's roll-outs, and why there are none where there could be."""
     said = bench.summary(unit) if bench.plan.is_fresh(unit) else {}
     variant = next(v for v in bench.plan.variants if v.name == unit.policy)
-    could = bench.experiment.dataset.simulator is not None and variant.is_trained
+    could = bench.experiment.dataset.simulator is not None and variant.is_rolled_out
     return {"rollouts": said.get("rollouts"), "no_rollouts": said.get("why_not") if could else None}
 
 
@@ -223,7 +223,7 @@ def _write_report(bench: Bench, draft) -> Outcome:
         bench.semantics,
         predictions,
         floors,
-        [load_rollouts(plan.folder(u)) for u in rolled],
+        [one for u in rolled for one in load_rollouts(plan.folder(u))],
         _curves(bench),
     )
     provenance = Provenance(

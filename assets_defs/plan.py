@@ -29,7 +29,7 @@ CODE_VERSIONS = {
     "learning_curve": "1",
     "trained_policy": "1",
     "predictions": "3",
-    "rollouts": "2",
+    "rollouts": "3",
     "scored_predictions": "2",
     "benchmark_table": "6",
     "benchmark_report": "7",
@@ -268,9 +268,10 @@ class Plan:
                 return _dump(e, {"protocol", "history"}) | {"asked": self._asked_of_scored(unit)}
             case "rollouts":
                 variant = self._variant_named[unit.asset.split("/")[0]]
-                settings = {"simulator": _installed(e.dataset.simulator), "rollouts": e.rollouts} | _execution(
-                    variant, e
-                )
+                settings = {"simulator": _installed(e.dataset.simulator)}
+                settings |= _dump(e, {"rollouts", "rollouts_from"}) | _execution(variant, e)
+                if variant.is_trained:
+                    settings |= {"seeds": e.rollout_seeds}
                 return settings | ({"safety": e.dataset.safety} if e.dataset.safety != SafetyConfig() else {})
             case "benchmark_table":
                 settings = {"name": e.name, "budget": e.budget_words, "champion": e.dataset.champion}

@@ -25,7 +25,7 @@ PREDICTIONS = """What `{name}` predicts at every held-out anchor, and how far th
 Errors are kept per episode, horizon and joint, so that every metric and interval can be made from them."""
 ROLLOUTS = """`{name}` acting in the simulator from numbered start states, the same for every policy.
 
-Where the data set has no simulator the record says so. Seed 0 of fold 0 is rolled out."""
+Where the data set has no simulator the record says so. The first `rollout_seeds` training seeds of fold 0 are rolled out."""
 
 
 def policy_assets(variant: Variant) -> list[dg.AssetsDefinition]:
@@ -284,8 +284,10 @@ def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcom
     save_rollouts(results, draft)
     summary = summarise_rollouts(results)
     to_mlflow.log_rollouts(tracking(bench), mlflow_run(bench, task, trained_unit), summary)
-    in_range = bool(((results.best_reward >= 0) & (results.best_reward <= 1)).all())
-    agree = bool((results.best_reward[results.success] >= 1).all())
-    words = [f"{summary['successes']} of {summary['n']} succeeded, score {summary['score']:.3f}"]
-    words += [f"{stage} {count}" for stage, count in zip(results.stage_names, results.stage_counts, strict=True)]
-    return Outcome({"rollouts": summary, "why_not": None}, {"sane": (in_range and agree, ", ".join(words))})
+    in_range = all(((one.best_reward >= 0) & (one.best_reward <= 1)).all() for one in results)
+    agree = all((one.best_reward[one.success] >= 1).all() for one in results)
+    words = [f"{summary['successes']} of {summary['episodes']} succeeded, score {summary['score']:.3f}"]
+    words += [
+        f"{s} {count}" for s, count in zip(summary.get("stages", ()), summary.get("stage_counts", ()), strict=True)
+    ]
+    return Outcome({"rollouts": summary, "why_not": None}, {"sane": (bool(in_range and agree), ", ".join(words))})

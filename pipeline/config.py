@@ -77,10 +77,30 @@ class BenchmarkConfig(Settings):
     budget: BudgetName = "standard"
     steps: Annotated[int, Field(ge=1)] | None = None
     rollouts: Annotated[int, Field(ge=1)] = 50
+    rollouts_from: Annotated[int, Field(ge=0)] = 0
+    rollout_seeds: Annotated[int, Field(ge=1)] = 1
     split_seed: Annotated[int, Field(ge=0)] = 0
     threads: Annotated[int, Field(ge=1, le=256)] = 2
     device: Literal["auto", "cpu", "cuda"] = "auto"
     executor: Literal["in_process"] = "in_process"
+
+    @model_validator(mode="after")
+    def _seeds_are_there(self):
+        check_rollout_seeds(self.rollout_seeds, self.seeds)
+        return self
+
+
+def check_rollout_seeds(rolled_out: int, trained: int) -> None:
+    """Only what was trained can be rolled out.
+
+    Raises:
+        ConfigError: more seeds are to be rolled out than are trained.
+    """
+    if rolled_out > trained:
+        raise ConfigError(
+            f"rollout_seeds is {rolled_out} and seeds is {trained}: only what is trained can be rolled out. Raise seeds or lower "
+            "rollout_seeds."
+        )
 
 
 class ObservationConfig(Settings):
@@ -383,7 +403,7 @@ def _check_execution(policy: PolicyConfig) -> None:
     if policy.execution == AS_USUAL:
         return
     if not METHODS[policy.method].trained:
-        raise ConfigError("execute, ensemble and delay are for policies that are rolled out, and baselines are not.")
+        raise ConfigError("execute, ensemble and delay are for policies that are trained, and baselines are not.")
     for chunk in sorted(policy.chunks) or [1]:
         settled(policy.execution, chunk)
 

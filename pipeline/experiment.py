@@ -42,6 +42,11 @@ class Variant:
     def is_trained(self) -> bool:
         return METHODS[self.method].trained
 
+    @property
+    def is_rolled_out(self) -> bool:
+        method = METHODS[self.method]
+        return method.trained if method.rolled_out is None else method.rolled_out
+
 
 class Experiment(Settings):
     """A data set and every setting that its numbers depend on (`device` and `threads` decide the last bits)."""
@@ -60,6 +65,15 @@ class Experiment(Settings):
     rollouts: int
     threads: int
     device: str
+    rollout_seeds: int = 1
+    rollouts_from: int = 0
+
+    optional = frozenset({"rollout_seeds", "rollouts_from"})
+
+    @property
+    def start_states(self) -> range:
+        """The numbers of the start states in closed loop."""
+        return range(self.rollouts_from, self.rollouts_from + self.rollouts)
 
     @property
     def observation_sets(self) -> list[ObservationSet]:
@@ -193,6 +207,8 @@ def _experiment(config: Config, name: str, dataset: DatasetConfig, config_dir: P
         budget=budget,
         steps=steps,
         rollouts=benchmark.rollouts,
+        rollout_seeds=benchmark.rollout_seeds,
+        rollouts_from=benchmark.rollouts_from,
         threads=benchmark.threads,
         device=benchmark.device,
     )

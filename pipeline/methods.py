@@ -20,7 +20,8 @@ class Method:
 
     chunk              "set": the config names chunk sizes, one policy each; "one": always a single action; "none": it
                        can be asked for any horizon and is scored on all
-    trained            it has seeds and training steps (and is rolled out where there is a simulator)
+    trained            it has seeds and training steps
+    rolled_out         it is rolled out where there is a simulator; None: if it is trained
     uses_observations  its answer depends on the observation set; else it runs once a data set
     frames             frames of `observation.state` that a method without an observation set looks at
     recipe             which windows it is made for (`windows.Recipe`)
@@ -33,6 +34,7 @@ class Method:
     cls: str
     chunk: Literal["set", "one", "none"] = "none"
     trained: bool = False
+    rolled_out: bool | None = None
     uses_observations: bool = True
     frames: int = 0
     recipe: Literal["arm", "every_frame"] = "arm"
@@ -66,7 +68,7 @@ class Methods(dict[str, Method]):
 
     def __missing__(self, name: str) -> Method:
         if name == EXTERNAL:
-            return Method("pipeline.external", "", chunk="set", trained=True)
+            return Method("pipeline.external", "", chunk="set", trained=True, rolled_out=False)
         if is_own(name):
             return Method("pipeline.policies.own", "OwnMethod", chunk="set", trained=True, takes=HISTORY, address=name)
         raise KeyError(name)
@@ -82,7 +84,9 @@ def is_own(name: str) -> bool:
 
 METHODS = Methods(
     {
-        "hold_still": Method("pipeline.policies.hold_still", "HoldStill", uses_observations=False, frames=1),
+        "hold_still": Method(
+            "pipeline.policies.hold_still", "HoldStill", rolled_out=True, uses_observations=False, frames=1
+        ),
         "mean_action": Method("pipeline.policies.mean_action", "MeanAction", uses_observations=False),
         "constant_velocity": Method(
             "pipeline.policies.constant_velocity", "ConstantVelocity", uses_observations=False, frames=2

@@ -322,7 +322,7 @@ AS_USUAL = Execution()
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Closed-loop results of one policy (seed 0 of fold 0) from numbered start states.
+    """Closed-loop results of one network (one training seed of fold 0) from numbered start states.
 
     start_states  [R] numbers       success [R] bool       best_reward [R] in 0 … 1       steps [R]
     best_coverage [R] in 0 … 1, NaN where the simulator has none
@@ -332,6 +332,7 @@ class Rollouts:
     execution     how its chunks were carried out
     interventions [R] frames in which the safety layer passed something else on than was asked for
     stopped       [R] why it stopped the robot (`safety.RUNS`: it did not)
+    seed          the training seed; 0 of what is not trained
     """
 
     simulator: str
@@ -349,6 +350,7 @@ class Rollouts:
     execution: Execution = AS_USUAL
     interventions: np.ndarray | None = None
     stopped: np.ndarray | None = None
+    seed: int = 0
 
     @property
     def stage_counts(self) -> list[int]:

@@ -44,7 +44,7 @@ class Entry:
     """One result to be compared, and what must be equal for that.
 
     fingerprint, mlflow_run_id   either of them, or its beginning, is what `@run` pins
-    rollouts                     closed-loop results, or None
+    rollouts                     closed-loop results, one a training seed; none where it was not rolled out
     unit                         of the errors, where all action columns share one
     steps, budget                of training, a number and in words; None where nobody here trained it
     seen                         whether it was trained on the episodes it is scored on; None: nothing is known
@@ -55,7 +55,7 @@ class Entry:
     observations: str
     trained: bool
     errors: "EpisodeErrors"
-    rollouts: "Rollouts | None"
+    rollouts: "Sequence[Rollouts]"
     fps: float
     unit: str | None
     data_hash: str
@@ -219,7 +219,7 @@ def _load(plan: "Plan", variant: Variant, observations: str) -> Entry:
         observations=observations,
         trained=variant.is_trained,
         errors=load_errors(plan.folder(predictions) / "errors.safetensors"),
-        rollouts=load_rollouts(plan.folder(rollouts)) if rolled_out else None,
+        rollouts=load_rollouts(plan.folder(rollouts)) if rolled_out else [],
         fps=facts["fps"],
         unit=units.pop() if len(units) == 1 else None,
         data_hash=facts["content_hash"],
@@ -258,7 +258,7 @@ def compare_entries(a: Entry, b: Entry) -> list[tuple[str, str, str, "Paired | s
         (a.address, b.address, metric, _compare_at(a, b, horizon))
         for metric, horizon in horizons_in_common(a.errors, b.errors, a.fps).items()
     ]
-    if a.rollouts is not None and b.rollouts is not None and (pair := compare_rollouts(a.rollouts, b.rollouts)):
+    if a.rollouts and b.rollouts and (pair := compare_rollouts(a.rollouts[0], b.rollouts[0])):
         found.append((a.address, b.address, "success", pair))
     return found
 

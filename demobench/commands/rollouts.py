@@ -45,14 +45,14 @@ def run_rollouts(
     session = open_session(config_path, store_path, json_to)
     asked = _asked(parse_numbers("--execute", execute, 1), parse_numbers("--delay", delay, 0), ensemble)
     found = find_trained(address, session)
-    first = found[0].task.experiment.rollouts if first is None else first
+    first = found[0].task.experiment.start_states.stop if first is None else first
     pairs, left_out = _that_can_be(found, asked)
     rows = []
     for one, execution in pairs:
         with _bar(session.console, f"{one.variant.name}, {_how(execution)}") as on_frame:
             numbers = range(first, first + starts)
             rolled = roll_out(one.task, one.folder, on_frame, start_states=numbers, execution=execution)
-        named = {"policy": one.variant.name, "observations": rolled.observations, "chunk": one.variant.chunk}
+        named = {"policy": one.variant.name, "observations": rolled[0].observations, "chunk": one.variant.chunk}
         rows.append(named | summarise_rollouts(rolled))
     if json_to != "-":
         _show(found[0].plan.key, rows, left_out, (first, starts), session.console)

@@ -50,7 +50,7 @@ def find_trained(text: str, session: Session) -> list[Found]:
         known = {name for v in plan.variants if v.is_trained for name in (v.name, v.family)}
         raise ConfigError(f"'{plan.key}' has no policy '{address.policy}'. {did_you_mean(address.policy, known)}")
     if not variants[0].is_trained:
-        raise ConfigError(f"'{address.policy}' is a baseline: nothing of it is trained, and it is not rolled out.")
+        raise ConfigError(f"'{address.policy}' is a baseline: nothing of it is trained.")
     return _load(plan, variants, _the_set(address, plan, variants[0]))
 
 

@@ -27,6 +27,7 @@ def rollout(
     start_states: Sequence[int],
     *,
     name: str,
+    seed: int = 0,
     history: int,
     execution: Execution = AS_USUAL,
     circular: np.ndarray | None = None,
@@ -45,7 +46,7 @@ def rollout(
     Args:
         policy: `predict(Observations) -> [S, B, K, A]`; the first seed acts.
         start_states: numbers of start states (`Simulator.start`).
-        name: of the policy, for the record.
+        name, seed: of the policy, for the record.
         history: frames the policy is shown.
         circular: [A] bool, action columns that an ensemble averages as directions.
         limits: of the safety layer; the simulator's own if none are given.
@@ -70,7 +71,7 @@ def rollout(
         parts.append({key: value[: len(block)] for key, value in episode.results().items()})
         stage_names, how = episode.stage_names, episode.execution
     results = _joined(parts)
-    _require_answers(results, name)
+    _require_answers(results, name, seed)
     return Rollouts(
         simulator=simulator.name,
         simulator_version=simulator.version(),
@@ -79,6 +80,7 @@ def rollout(
         start_states=np.asarray(numbers, dtype=np.int64),
         stage_names=stage_names,
         execution=how,
+        seed=seed,
         **results,
     )
 
@@ -190,11 +192,12 @@ class _Episode:
         return np.where(moved[:, None], place, np.nan).astype(np.float32)
 
 
-def _require_answers(results: dict[str, np.ndarray | None], name: str) -> None:
+def _require_answers(results: dict[str, np.ndarray | None], name: str, seed: int) -> None:
     """A policy that cannot be asked at all has no success rate."""
     if ((results["stopped"] == NOT_FINITE) & (results["steps"] == 0)).all():
         raise PolicyError(
-            f"Policy '{name}' answered with NaN or infinite actions in a roll-out, at the first step of every episode. "
+            f"Policy '{name}' answered with NaN or infinite actions in a roll-out (seed {seed}), at the first step of every "
+            "episode. "
             "Its training has probably diverged: look at its loss."
         )
 

@@ -1,7 +1,7 @@
 """A trained policy of a benchmark in its data set's simulator, and the files of what happened.
 
-What belongs here: from a task and a folder of weights to `Rollouts`. What does not: the loop itself (`rollout`), success
-rates and their intervals (`statistics.success`).
+What belongs here: from a task and a folder of weights to `Rollouts`, one a training seed. What does not: the loop itself (`rollout`),
+success rates and their intervals (`statistics.closed_loop`).
 """
 
 import json
@@ -20,7 +20,7 @@ from pipeline.simulate.rollout import rollout
 from pipeline.types import ACTION, Execution, Rollouts
 
 TEXTS = ("simulator", "simulator_version", "policy", "observations")
-STAGE_NAMES, EXECUTION = "stage_names", "execution"
+STAGE_NAMES, EXECUTION, SEED = "stage_names", "execution", "seed"
 
 
 def roll_out(
@@ -28,10 +28,14 @@ def roll_out(
     trained: Path,
     on_frame: Callable[[int, int], None] | None = None,
     *,
+    seeds: int | None = None,
     start_states: Sequence[int] | None = None,
     execution: Execution | None = None,
-) -> Rollouts:
-    """Seed 0 of fold 0, from the numbered start states 0 … n − 1 and as the policy's settings say, unless told otherwise.
+) -> list[Rollouts]:
+    """The first training seeds of fold 0, each from the same start states; how many of both, and how chunks are carried out,
+    is as the settings say unless told otherwise. What is not trained is rolled out once.
+
+    `on_frame` is called with (frames done, frames at most), over all seeds.
 
     Raises:
         NotApplicableError: the data set has no simulator, or policies like this one cannot be asked in it.
@@ -41,40 +45,62 @@ def roll_out(
     name = task.experiment.dataset.simulator
     if name is None:
         raise NotApplicableError("no simulator for this data set")
-    if not task.variant.is_trained:
-        raise NotApplicableError("baselines are not rolled out")
+    if not task.variant.is_rolled_out:
+        raise NotApplicableError("of the baselines only hold_still is rolled out")
     simulator = simulator_for(name, task.demos, task.observation_set)
     policy = load_fold(task, trained, 0)
     fold = task.split.folds[0]
-    return rollout(
-        policy.one_seed(0),
-        simulator,
-        task.observation_set,
-        range(task.experiment.rollouts) if start_states is None else start_states,
-        name=task.variant.name,
-        history=task.windows(fold.test, fold).history,
-        execution=execution or task.policy.execution,
-        limits=tighter(simulator.limits(), task.experiment.dataset.safety, task.demos.features[ACTION]),
-        circular=circular_columns(task.demos, task.semantics, [ACTION]),
-        on_frame=on_frame,
-    )
+    chosen = task.seeds[: task.experiment.rollout_seeds if seeds is None else seeds]
+    return [
+        rollout(
+            policy.one_seed(position) if task.variant.is_trained else policy,
+            simulator,
+            task.observation_set,
+            task.experiment.start_states if start_states is None else start_states,
+            name=task.variant.name,
+            seed=seed,
+            history=task.windows(fold.test, fold).history,
+            execution=execution or task.policy.execution,
+            limits=tighter(simulator.limits(), task.experiment.dataset.safety, task.demos.features[ACTION]),
+            circular=circular_columns(task.demos, task.semantics, [ACTION]),
+            on_frame=on_frame and _counting_from(on_frame, position, len(chosen)),
+        )
+        for position, seed in enumerate(chosen)
+    ]
 
 
-def save_rollouts(rollouts: Rollouts, folder: Path) -> None:
+def _counting_from(on_frame: Callable[[int, int], None], position: int, seeds: int) -> Callable[[int, int], None]:
+    return lambda done, total: on_frame(position * total + done, seeds * total)
+
+
+def save_rollouts(rollouts: Sequence[Rollouts], folder: Path) -> None:
+    """The roll-outs of one policy, a folder `seed_0`, … each."""
+    for one in rollouts:
+        place = folder / f"seed_{one.seed}"
+        place.mkdir()
+        _save(one, place)
+
+
+def load_rollouts(folder: Path) -> list[Rollouts]:
+    """The inverse of `save_rollouts`, by seed."""
+    return sorted((_load(place) for place in folder.glob("seed_*")), key=lambda one: one.seed)
+
+
+def _save(rollouts: Rollouts, folder: Path) -> None:
     """Arrays as safetensors, words as JSON."""
     from safetensors.numpy import save_file
 
-    words_of = (*TEXTS, STAGE_NAMES, EXECUTION)
+    words_of = (*TEXTS, STAGE_NAMES, EXECUTION, SEED)
     arrays = {f.name: getattr(rollouts, f.name) for f in fields(rollouts) if f.name not in words_of}
     present = {name: np.ascontiguousarray(array) for name, array in arrays.items() if array is not None}
     save_file(present, folder / "rollouts.safetensors")
-    words = {name: getattr(rollouts, name) for name in TEXTS} | {EXECUTION: asdict(rollouts.execution)}
+    words = {name: getattr(rollouts, name) for name in (*TEXTS, SEED)} | {EXECUTION: asdict(rollouts.execution)}
     words |= {STAGE_NAMES: rollouts.stage_names} if rollouts.stage_names else {}
     (folder / "rollouts.json").write_text(json.dumps(words))
 
 
-def load_rollouts(folder: Path) -> Rollouts:
-    """The inverse of `save_rollouts`."""
+def _load(folder: Path) -> Rollouts:
+    """The inverse of `_save`."""
     from safetensors.numpy import load_file
 
     arrays = load_file(folder / "rollouts.safetensors")

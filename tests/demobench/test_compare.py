@@ -80,7 +80,7 @@ class Place:
                 folder / "errors.safetensors",
             )
             if (rolled := (rollouts or {}).get((policy, entry))) is not None:
-                save_rollouts(rolled, self._write(plan, Unit(f"{policy}/rollouts", entry), {"rollouts": {"n": 1}}))
+                save_rollouts([rolled], self._write(plan, Unit(f"{policy}/rollouts", entry), {"rollouts": {"n": 1}}))
 
     def _write(self, plan: Plan, unit: Unit, summary, fingerprint: str | None = None):
         plan.forget()

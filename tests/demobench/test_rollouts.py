@@ -96,8 +96,9 @@ def test_left_alone_it_is_as_the_configuration_says(session, made, tmp_path):
     (row,) = json.loads(said.read_text())["rows"]
     assert row["execution"] == {"execute": 4, "ensemble": False, "delay": 0}
     (one,) = find_trained("tiny/mlp_k16/pose", session)
-    assert roll_out(one.task, one.folder).execution == Execution(4)
-    assert roll_out(one.task, one.folder).best_reward.mean() == row["score"]
+    (rolled,) = roll_out(one.task, one.folder)
+    assert (rolled.execution, rolled.seed) == (Execution(4), 0)
+    assert rolled.best_reward.mean() == row["score"]
 
 
 @pytest.mark.parametrize(

@@ -34,14 +34,15 @@ def rolled(**changes) -> Rollouts:
     ids=["in the plane", "as an ensemble, guarded", "with stages"],
 )  # fmt: skip
 def test_written_and_read_again(tmp_path, changes):
-    written = rolled(**changes)
+    written = [rolled(seed=seed, **changes) for seed in (0, 2, 10)]
     save_rollouts(written, tmp_path)
-    read = load_rollouts(tmp_path)
-    for f in fields(Rollouts):
-        np.testing.assert_array_equal(getattr(read, f.name), getattr(written, f.name), err_msg=f.name)
-    assert read.stage_counts == written.stage_counts
+    assert {place.name for place in tmp_path.iterdir()} == {"seed_0", "seed_2", "seed_10"}
+    for read, one in zip(load_rollouts(tmp_path), written, strict=True):
+        for f in fields(Rollouts):
+            np.testing.assert_array_equal(getattr(read, f.name), getattr(one, f.name), err_msg=f.name)
+        assert read.stage_counts == one.stage_counts
 
 
 def test_a_simulator_without_stages_writes_nothing_of_them(tmp_path):
-    save_rollouts(rolled(), tmp_path)
-    assert "stage" not in (tmp_path / "rollouts.json").read_text()
+    save_rollouts([rolled()], tmp_path)
+    assert "stage" not in (tmp_path / "seed_0/rollouts.json").read_text()
