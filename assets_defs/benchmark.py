@@ -119,10 +119,16 @@ def _write_table(bench: Bench, draft) -> Outcome:
 
 def _rolled_out(bench: Bench, unit: Unit) -> dict:
     """What came of a policy's roll-outs, and why there are none where there could be."""
+    from pipeline.simulate.trial import load_rollouts
+
     said = bench.summary(unit) if bench.plan.is_fresh(unit) else {}
     variant = next(v for v in bench.plan.variants if v.name == unit.policy)
     could = bench.experiment.dataset.simulator is not None and variant.is_rolled_out
-    return {"rollouts": said.get("rollouts"), "no_rollouts": said.get("why_not") if could else None}
+    return {
+        "rollouts": said.get("rollouts"),
+        "rolled_out": load_rollouts(bench.plan.folder(unit)) if said.get("rollouts") else [],
+        "no_rollouts": said.get("why_not") if could else None,
+    }
 
 
 def _entry_from_elsewhere(bench: Bench, unit: Unit) -> dict:

@@ -31,8 +31,8 @@ CODE_VERSIONS = {
     "predictions": "3",
     "rollouts": "3",
     "scored_predictions": "2",
-    "benchmark_table": "6",
-    "benchmark_report": "7",
+    "benchmark_table": "7",
+    "benchmark_report": "8",
     "mcap_log": "1",
     "rerun_recording": "1",
 }

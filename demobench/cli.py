@@ -73,6 +73,8 @@ def run(
     protocol: Annotated[
         Protocol | None, typer.Option(help="strict, or notebook to reproduce published numbers.")
     ] = None,
+    rollouts: Annotated[int | None, typer.Option(min=1, help="Start states in closed loop.")] = None,
+    rollout_seeds: Annotated[int | None, typer.Option(min=1, help="Training seeds in closed loop.")] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="auto, cpu or cuda.")] = None,
     config: ConfigOption = None,
     store: StoreOption = None,
@@ -85,7 +87,8 @@ def run(
         datasets or [],
         choices={
             "policies": policies, "chunks": chunks, "observations": observations, "seeds": seeds, "steps": steps,
-            "budget": budget, "folds": folds, "protocol": protocol, "device": device,
+            "budget": budget, "folds": folds, "protocol": protocol, "rollouts": rollouts, "rollout_seeds": rollout_seeds,
+            "device": device,
         },
         config_path=config,
         store_path=store,
@@ -236,6 +239,7 @@ def curve(
     epilog="""Examples:\n
     demobench rollouts pusht_sim/mlp_k16/pose                               once more, from other start states\n
     demobench rollouts pusht_sim/mlp/pose --execute 1,4,8 --delay 0,2       every chunk, executed actions and delay\n
+    demobench rollouts pusht_sim/mlp_k16/pose --seeds 3 --starts 500        three training seeds\n
     demobench rollouts so101_sim/mlp_k16/pose --execute 8 --ensemble --starts 200 --from 1000 --json -"""
 )
 def rollouts(
@@ -247,6 +251,9 @@ def rollouts(
     ] = None,
     delay: Annotated[str | None, typer.Option(help="Frames from a question to its answer: 0,2")] = None,
     ensemble: Annotated[bool, typer.Option("--ensemble", help="Also (or only) as a temporal ensemble.")] = False,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Training seeds, at most those trained; else as the configuration says.")
+    ] = None,
     starts: Annotated[int, typer.Option(min=1, help="Start states.")] = 100,
     first: Annotated[
         int | None,
@@ -260,8 +267,8 @@ def rollouts(
     from demobench.commands.rollouts import run_rollouts
 
     run_rollouts(
-        address, execute=execute, delay=delay, ensemble=ensemble, starts=starts, first=first, config_path=config,
-        store_path=store, json_to=json_to,
+        address, execute=execute, delay=delay, ensemble=ensemble, seeds=seeds, starts=starts, first=first,
+        config_path=config, store_path=store, json_to=json_to,
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from pipeline.config import (
     PolicyConfig,
     Settings,
     check_policy,
+    check_rollout_seeds,
     check_slug,
     hash_of,
 )
@@ -267,6 +268,8 @@ class Choices:
     budget: BudgetName | None = None
     folds: int | None = None
     protocol: Protocol | None = None
+    rollouts: int | None = None
+    rollout_seeds: int | None = None
     device: str | None = None
 
 
@@ -357,9 +360,14 @@ def with_choices(base: Experiment, choices: Choices) -> Experiment:
     """The settings that the choices lead to; equal to `base` where they change nothing."""
     updates: dict[str, Any] = {
         field: value
-        for field in ("seeds", "folds", "protocol", "device")
+        for field in ("seeds", "folds", "protocol", "rollouts", "rollout_seeds", "device")
         if (value := getattr(choices, field)) is not None and value != getattr(base, field)
     }
+    seeds, rolled_out = (updates.get(field, getattr(base, field)) for field in ("seeds", "rollout_seeds"))
+    if choices.rollout_seeds is not None:
+        check_rollout_seeds(rolled_out, seeds)
+    elif rolled_out > seeds:  # fewer seeds on the command line are fewer everywhere
+        updates["rollout_seeds"] = seeds
     if choices.budget is not None:
         updates |= {"budget": choices.budget, "steps": BUDGETS[choices.budget]}
     if choices.steps is not None and choices.steps != base.steps:

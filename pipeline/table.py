@@ -16,6 +16,7 @@ from pipeline.experiment import Experiment, Variant
 from pipeline.external.pairing import Rival, judge_with_elsewhere
 from pipeline.methods import METHODS
 from pipeline.statistics.brackets import Scored, Sight, form_brackets, gap_to_floor, sight_of, value_of_sensors
+from pipeline.statistics.closed_loop import Driven, closed_loop_verdicts
 from pipeline.statistics.comparisons import table_comparisons
 from pipeline.types import FloorEstimate, ObservationSet, RadiusFloor, Split
 
@@ -44,8 +45,9 @@ def build_table(
     facts : what `quality.inspect_dataset` found.
     floors, estimates : the notebook's floors, and those that policies are held against.
     entries : one a row: `variant`, `observations`, `metrics` (`metrics.Score.metrics`), `errors` (`EpisodeErrors`),
-        `windows_train`, `windows_test`, `latency_ms`, `latency_p99_ms`, `parameters`, `train_s`, `rollouts` (a summary or None)
-        and `no_rollouts` (why there are none where there could be). One that was predicted elsewhere also has `elsewhere`:
+        `windows_train`, `windows_test`, `latency_ms`, `latency_p99_ms`, `parameters`, `train_s`, `rollouts` (a summary or None),
+        `rolled_out` (what it sums up: `Rollouts`, one a seed) and `no_rollouts` (why there are none where there could be). One
+        that was predicted elsewhere also has `elsewhere`:
         `seen_in_training`, `training` (words), `episodes`, `samples`, `warnings` and `sight_stated`.
     modes : `modes.ModesEvidence` as dictionaries.
 
@@ -75,6 +77,7 @@ def build_table(
         "modes": list(modes),
         "policies": rows,
         "comparisons": comparisons,
+        "closed_loop": closed_loop_verdicts(_driven(rows, entries), experiment.dataset.champion),
         "artifacts": {"report": None, "mcap": None, "rerun": None, "mlflow": None},
     }
     return json_safe(table)
@@ -114,6 +117,17 @@ def _compare(
             seen = by_address[comparison.a].get("seen_in_training")
             by_address[comparison.a]["verdict"][name + ahead] = None if seen else comparison.word
     return [asdict(comparison) for comparison in found]
+
+
+def _driven(rows: Sequence[Mapping[str, Any]], entries: Sequence[Mapping[str, Any]]) -> list[Driven]:
+    """What was rolled out, in the order of the rows."""
+    rolled = {(e["variant"].name, e["observations"]): e for e in entries if e.get("rolled_out")}
+    found = [(row, rolled.get((row["policy"], row["observations"]))) for row in rows]
+    return [
+        Driven(f"{row['policy']}/{row['observations']}", entry["variant"].is_trained, entry["rolled_out"])
+        for row, entry in found
+        if entry
+    ]
 
 
 def _rival(entry: Mapping[str, Any]) -> Rival:

@@ -16,7 +16,9 @@ from tests.hand_made import STATE_ONLY, random_walks, semantics
 from tests.sinks.making import make_comparison, make_demos, make_gap, make_semantics, make_table, make_verdict
 from tests.statistics.test_metrics import scored, task_of
 
-ROLLOUTS = {"n": 50, "successes": 21, "success": 0.42, "success_interval": [0.28, 0.57], "score": 0.83}
+ROLLOUTS = {
+    "n": 50, "seeds": 1, "episodes": 50, "successes": 21, "success": 0.42, "success_interval": [0.28, 0.57], "score": 0.83,
+}  # fmt: skip
 ROW = {
     "policy", "method", "chunk", "observations", "seeds", "windows_train", "windows_test", "first_step_mae",
     "first_step_rmse", "first_step_l2", "at_one_second_mae", "whole_chunk_mae", "error_by_horizon",

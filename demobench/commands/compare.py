@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
 MOST_ROWS = 30
 """All pairs of more would be a family in which hardly anything can show."""
-TITLES = {"first_step_mae": "first step, MAE", "at_one_second_mae": "at one second, MAE", "success": "success rate"}
+TITLES = {
+    "first_step_mae": "first step, MAE", "at_one_second_mae": "at one second, MAE", "success": "success rate, closed loop",
+    "score": "score, closed loop",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ def compare_policies(
     StoreError : a result that is not up to date, or a pin that the store no longer holds.
     """
     from pipeline.external.pairing import UNKNOWN
-    from pipeline.statistics.comparisons import judge
+    from pipeline.statistics.closed_loop import judge_with_rollouts
 
     session = open_session(config_path, store_path, json_to)
     found = [entry for text in addresses for entry in _entries(parse_address(text), session)]
@@ -106,7 +109,7 @@ def compare_policies(
     unknown = {entry.address for entry in entries if entry.seen is None}
     verdicts = [
         replace(v, words=v.words + UNKNOWN) if v.word != "not comparable" and {v.a, v.b} & unknown else v
-        for v in judge(pairs)
+        for v in judge_with_rollouts(pairs)
     ]
     family = sum(verdict.p_holm is not None for verdict in verdicts)
     if json_to != "-":
@@ -246,6 +249,7 @@ def _check_pin(address: Address, entry: Entry) -> None:
 
 def compare_entries(a: Entry, b: Entry) -> list[tuple[str, str, str, "Paired | str"]]:
     """Two results on every metric that both have, or the first thing that keeps them from being compared."""
+    from pipeline.statistics.closed_loop import METRICS, compare_rollouts
     from pipeline.statistics.comparisons import horizons_in_common
 
     why = _data_differs(a, b)
@@ -258,8 +262,12 @@ def compare_entries(a: Entry, b: Entry) -> list[tuple[str, str, str, "Paired | s
         (a.address, b.address, metric, _compare_at(a, b, horizon))
         for metric, horizon in horizons_in_common(a.errors, b.errors, a.fps).items()
     ]
-    if a.rollouts and b.rollouts and (pair := compare_rollouts(a.rollouts[0], b.rollouts[0])):
-        found.append((a.address, b.address, "success", pair))
+    if a.rollouts and b.rollouts:
+        trained = (a.trained, b.trained)
+        found += [
+            (a.address, b.address, metric, compare_rollouts(a.rollouts, b.rollouts, metric, trained=trained))
+            for metric in METRICS
+        ]
     return found
 
 
@@ -289,25 +297,6 @@ def _recipe_differs(a: Entry, b: Entry) -> str | None:
     return None
 
 
-def compare_rollouts(a: "Rollouts", b: "Rollouts") -> "Paired | None":
-    """Success from the same start states in the same simulator, by exact McNemar; None where those differ.
-
-    One network of each was rolled out, so nothing is said about other seeds.
-    """
-    import numpy as np
-
-    from pipeline.statistics.comparisons import compare_paired
-    from pipeline.statistics.success import mcnemar
-
-    same_world = (a.simulator, a.simulator_version) == (b.simulator, b.simulator_version)
-    if not same_world or not np.array_equal(a.start_states, b.start_states):
-        return None
-    pair = compare_paired(a.success[None].astype(float), b.success[None].astype(float))
-    pair = replace(pair, p=None if pair.p is None else mcnemar(a.success, b.success), sampled="start states")
-    # Equal so far is not equal for ever: no interval of zero width.
-    return replace(pair, interval=None, smallest_seen=None) if pair.same else pair
-
-
 # What is shown -------------------------------------------------------------------------------------------------------
 
 
@@ -327,7 +316,7 @@ def show_verdicts(verdicts: Sequence["Comparison"], family: int, entries: Sequen
     console.print()
     for metric in TITLES:
         if rows := [verdict for verdict in verdicts if verdict.metric == metric]:
-            unit = entries[0].unit if metric != "success" else None
+            unit = entries[0].unit if metric.endswith("_mae") else None
             title = f"{TITLES[metric]}{f', {unit}' if unit else ''}"
             if len(rows) > MANY and len({(row.word, row.words) for row in rows}) == 1:
                 console.print(
@@ -426,8 +415,14 @@ def _footnotes(verdicts: Sequence["Comparison"], family: int, entries: Sequence[
             "visible from: the difference that would be seen 80 % of the time in a test at 0.05 on its own.",
         ]
     if any(verdict.metric == "success" for verdict in verdicts):
+        most = max(len(entry.rollouts) for entry in entries)
+        networks = (
+            f"{most} seeds of fold 0"
+            if most > 1
+            else "one network of each (seed 0 of fold 0), success by exact McNemar"
+        )
         lines.append(
-            "success: a difference above zero is better; exact McNemar, one network of each (seed 0 of fold 0)."
+            f"closed loop: over start states in place of episodes, {networks}; a difference above zero is better."
         )
     if len(entries) <= 4:
         lines += [

@@ -26,6 +26,7 @@ def run_rollouts(
     execute: str | None,
     delay: str | None,
     ensemble: bool,
+    seeds: int | None,
     starts: int,
     first: int | None,
     config_path: Path | None,
@@ -36,7 +37,7 @@ def run_rollouts(
 
     Raises
     ------
-    ConfigError : nothing of what was asked for can be carried out.
+    ConfigError : nothing of what was asked for can be carried out, or more seeds are asked for than were trained.
     NotApplicableError : the data set has no simulator that is installed and fits.
     """
     from pipeline.simulate.trial import roll_out
@@ -46,12 +47,17 @@ def run_rollouts(
     asked = _asked(parse_numbers("--execute", execute, 1), parse_numbers("--delay", delay, 0), ensemble)
     found = find_trained(address, session)
     first = found[0].task.experiment.start_states.stop if first is None else first
+    trained = found[0].task.experiment.seeds
+    if seeds is not None and seeds > trained:
+        raise ConfigError(
+            f"--seeds is {seeds}, and {found[0].variant.name} was trained with {trained}: ask for at most so many."
+        )
     pairs, left_out = _that_can_be(found, asked)
     rows = []
     for one, execution in pairs:
         with _bar(session.console, f"{one.variant.name}, {_how(execution)}") as on_frame:
             numbers = range(first, first + starts)
-            rolled = roll_out(one.task, one.folder, on_frame, start_states=numbers, execution=execution)
+            rolled = roll_out(one.task, one.folder, on_frame, seeds=seeds, start_states=numbers, execution=execution)
         named = {"policy": one.variant.name, "observations": rolled[0].observations, "chunk": one.variant.chunk}
         rows.append(named | summarise_rollouts(rolled))
     if json_to != "-":
@@ -113,18 +119,19 @@ def _show(
     first, starts = at
     console.print(
         f"[bold]{escape(key)}[/]: {escape(rows[0]['observations'])}, start states {first} to {first + starts - 1} of "
-        f"{rows[0]['simulator']}, seed 0 of fold 0",
+        f"{rows[0]['simulator']}, {_networks(rows[0])}",
         soft_wrap=True,
     )
     table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     for head in ("policy", "chunk", "executed", "delay", "success", "95 %", "score", "stepped\nin", "stopped"):
         table.add_column(head, no_wrap=True, justify="left" if head == "policy" else "right")
     for row in rows:
-        low, high = row["success_interval"]
+        interval = row["success_interval"]
         how = row["execution"]
         table.add_row(
             escape(row["policy"]), str(row["chunk"]), "ensemble" if how["ensemble"] else str(how["execute"]),
-            str(how["delay"]), f"[bold]{row['successes']}/{row['n']}[/]", f"{100 * low:.0f}–{100 * high:.0f} %",
+            str(how["delay"]), f"[bold]{row['successes']}/{row['episodes']}[/]",
+            f"{100 * interval[0]:.0f}–{100 * interval[1]:.0f} %" if interval else "—",
             f"{row['score']:.3f}", f"{100 * row['intervened']:.2g} %", str(row["stopped"]),
         )  # fmt: skip
     console.print(table)
@@ -137,8 +144,16 @@ def _show(
         )
     console.print(
         "Stepped in: the share of frames in which the safety layer passed something else on; stopped: episodes that it ended.\n"
-        "Intervals (Clopper–Pearson) are of each row alone: the best of many is partly luck. Roll it out again from start "
-        "states that chose nothing (--from).",
+        f"Intervals ({_intervals(rows[0])}) are of each row alone: the best of many is partly luck. Roll it out again from "
+        "start states that chose nothing (--from).",
         style="dim",
         soft_wrap=True,
     )
+
+
+def _networks(row: Mapping[str, Any]) -> str:
+    return "seed 0 of fold 0" if row["seeds"] == 1 else f"seeds 0 to {row['seeds'] - 1} of fold 0"
+
+
+def _intervals(row: Mapping[str, Any]) -> str:
+    return "Clopper–Pearson" if row["seeds"] == 1 else f"over start states and {row['seeds']} seeds"

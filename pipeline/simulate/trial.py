@@ -1,7 +1,7 @@
 """A trained policy of a benchmark in its data set's simulator, and the files of what happened.
 
-What belongs here: from a task and a folder of weights to `Rollouts`, one a training seed. What does not: the loop itself (`rollout`),
-success rates and their intervals (`statistics.closed_loop`).
+What belongs here: from a task and a folder of weights to `Rollouts`, one a training seed. What does not: the loop itself
+(`rollout`), success rates and their intervals (`statistics.closed_loop`).
 """
 
 import json

@@ -19,6 +19,7 @@ from pipeline.sinks.findings import (
     family,
     first_step_gap,
     not_held,
+    success_words,
     without_floor,
 )
 from pipeline.sinks.palette import is_baseline
@@ -226,11 +227,12 @@ def _common(table: Table) -> dict[str, str]:
         entries["Better, worse, cannot tell"] = _verdict_words(table)
     if table["brackets"]:
         entries |= _floors(table)
-    trials = max((row["rollouts"]["n"] for row in table["policies"] if row["rollouts"]), default=0)
-    if trials:
+    if words := success_words(table):
         entries["Success and score"] = (
-            f"One trained network (seed 0 of fold 0) from {trials} numbered start states; interval by Clopper and "
-            "Pearson. The score is the mean over start states of the best reward of the episode, from 0 to 1. The safety layer "
+            f"From numbered start states, the same for every policy: {words}. Of several seeds the rate is the mean over them and "
+            "over start states; its interval, like every interval of a score, is by bootstrap-t over start states, with what "
+            "seeds vary by. Where all start states give the same, it is what so many that are alike make sure. The score is the "
+            "mean over start states of the best reward of the episode, from 0 to 1. The safety layer "
             "passes on what keeps the robot's limits, whatever a policy asks for; it stops an episode where an action is not "
             "finite, or as the configuration says."
         )

@@ -322,7 +322,7 @@ def _left_out(names: Sequence[str]) -> str:
 
 
 def rollout_figure(rollouts: Sequence[Rollouts], demos: Demonstrations) -> Figure | None:
-    """The best trained policy's drives, where its end effector moves in a plane."""
+    """The best network's drives, where its end effector moves in a plane."""
     drawn = [one for one in rollouts if one.paths is not None and len(one.success)]
     if not drawn:
         return None
@@ -331,7 +331,7 @@ def rollout_figure(rollouts: Sequence[Rollouts], demos: Demonstrations) -> Figur
     unit = feature.units[0]
     chart = planes.rollout_paths(best.paths, best.success, names=feature.names[:2], unit=unit, down=_counts_down(unit))
     reading = (
-        f"{best.policy} ({best.observations}) drives by itself in the simulator {best.simulator} "
+        f"{best.policy} ({best.observations}, seed {best.seed}) drives by itself in the simulator {best.simulator} "
         f"{best.simulator_version} from {len(best.success)} numbered start states; a dot where each drive begins. "
         f"Task done in {int(best.success.sum())}."
     )

@@ -20,6 +20,8 @@ Row = Mapping[str, Any]
 MARKS = {"better": "✓", "cannot tell": "?", "worse": "✗", "not comparable": "–"}
 """Beside a verdict's word, so that neither colour nor reading is needed to find it."""
 LOSSES = {"rmse": "RMSE", "mae": "MAE", "l2": "L2"}
+DRIVEN = ("success", "score")
+"""What is compared in closed loop."""
 MOST_NAMED, MOST_LEFT_OUT = 5, 12
 
 
@@ -46,7 +48,7 @@ def answer(table: Table) -> list[Sentence]:
         found += [*_against_champion(table, rows), *_first_step_floor(table, best), *_later_floor(table, best)]
     found += [_from_elsewhere(table, row) for row in table["policies"] if is_elsewhere(row)]
     driven = [row for row in table["policies"] if row["rollouts"]]
-    return [*found, _best_driven(driven)] if driven else found
+    return [*found, _best_driven(driven), *_driven_verdicts(table)] if driven else found
 
 
 def excluded_words(table: Table) -> str:
@@ -177,7 +179,7 @@ def _stepped_in(rollouts: Mapping[str, Any]) -> str:
     share, stopped, broken = (rollouts[name] for name in ("intervened", "stopped", "stopped_not_finite"))
     why = f", {broken} for actions that are not finite" if broken else ""
     small = f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
-    return f"{small} ({stopped} of {rollouts['n']} episodes stopped{why})" if stopped else small
+    return f"{small} ({stopped} of {rollouts['episodes']} episodes stopped{why})" if stopped else small
 
 
 def _samples_words(scores: Mapping[str, Any], unit: str) -> str:
@@ -293,8 +295,10 @@ def _best_driven(rows: Sequence[Row]) -> Sentence:
         none = f"In closed loop no policy succeeds from any of {n} start states; the highest score is that of "
         return [none, *who(most), ": ", Strong(show(most["rollouts"]["score"])), ".", *_how_far(most)]
     percent = f" ({100 * interval[0]:.0f}–{100 * interval[1]:.0f} %)" if show_interval(interval) else ""
-    often = Strong(f"{round(rate * n)} of {n}")
-    return ["In closed loop ", *who(most), " succeeds most often: ", often, f"{percent}.", *_how_far(most)]
+    seeds, episodes = most["rollouts"]["seeds"], most["rollouts"]["episodes"]
+    often = Strong(f"{round(rate * episodes)} of {episodes}")
+    networks = f", {seeds} training seeds from {n} start states" if seeds > 1 else ""
+    return ["In closed loop ", *who(most), " succeeds most often: ", often, f"{percent}{networks}.", *_how_far(most)]
 
 
 def _how_far(row: Row) -> Sentence:
@@ -303,7 +307,75 @@ def _how_far(row: Row) -> Sentence:
     if not rollouts.get("stages"):
         return []
     counts = (f"{stage} {count}" for stage, count in zip(rollouts["stages"], rollouts["stage_counts"], strict=True))
-    return [f" Of its {rollouts['n']} roll-outs: {', '.join(counts)}."]
+    return [f" Of its {rollouts['episodes']} roll-outs: {', '.join(counts)}."]
+
+
+def _driven_verdicts(table: Table) -> list[Sentence]:
+    """Who does better in closed loop than the champion, or than whoever does best there."""
+    found = table.get("closed_loop")
+    if not found or not found["comparisons"]:
+        return []
+    success, score = (
+        _driven_groups(table, [c for c in found["comparisons"] if c["metric"] == metric]) for metric in DRIVEN
+    )
+    said = f"success and score: {success}" if success == score else f"success: {success}. Score: {score}"
+    if found["chosen"] == "champion":
+        named = Strong(name_in(table, found["reference"]))
+        return [["In closed loop, against the champion ", named, f" – {said}."]]
+    return [["Against it in closed loop – ", f"{said}."]]
+
+
+def _driven_groups(table: Table, comparisons: Sequence[Mapping[str, Any]]) -> str:
+    """Word by word who it is said of; of what cannot be told also what it would take."""
+    parts = []
+    for word in MARKS:
+        if group := [c for c in comparisons if c["word"] == word]:
+            names = _listed(table, [c["a"] for c in group])
+            parts.append(f"{word}: {names}{_what_it_takes(group) if word == 'cannot tell' else ''}")
+    return "; ".join(parts)
+
+
+def _what_it_takes(comparisons: Sequence[Mapping[str, Any]]) -> str:
+    """The start states that would tell, where start states are what is missing."""
+    needs = [c["needs_episodes"] for c in comparisons if c["needs_episodes"] and "seeds" not in c["words"]]
+    if not needs:
+        return ""
+    least, most = min(needs), max(needs)
+    return f" (it would take about {least:,}{f' to {most:,}' if most > least else ''} start states)"
+
+
+def driven_word(table: Table, where: str) -> str | None:
+    """The verdict on a row's success in closed loop."""
+    comparisons = (table.get("closed_loop") or {}).get("comparisons", ())
+    return next((c["word"] for c in comparisons if (c["a"], c["metric"]) == (where, "success")), None)
+
+
+def driven_family_words(table: Table) -> str:
+    """What verdicts in closed loop rest on; nothing where there are none."""
+    found = table.get("closed_loop")
+    if not found or not found["comparisons"]:
+        return ""
+    number, name = found["family"], name_in(table, found["reference"])
+    if not number:
+        return "No difference was tested: a verdict needs at least five start states and two policies that do not always agree."
+    together = f"{plural(number, 'comparison')} in a family of their own" if number > 1 else "One comparison"
+    rival = (
+        f"against the champion, {name}"
+        if found["chosen"] == "champion"
+        else f"against {name}, which does best from these very start states: it was chosen there, so all pairs count"
+    )
+    return f"{together}, {rival}; a verdict needs p ≤ 0.05 after Holm's correction."
+
+
+def success_words(table: Table) -> str:
+    """What success and score are of, and how their intervals were made; nothing where nothing was rolled out."""
+    rolled = [row["rollouts"] for row in table["policies"] if row["rollouts"]]
+    if not rolled:
+        return ""
+    starts, seeds = (max(one[name] for one in rolled) for name in ("n", "seeds"))
+    if seeds == 1:
+        return f"{starts} start states, one network (seed 0 of fold 0), Clopper–Pearson 95 %"
+    return f"{starts} start states × {seeds} seeds of fold 0, 95 % over both"
 
 
 # Floors ---------------------------------------------------------------------------------------------------------------

@@ -19,7 +19,13 @@ from pipeline.sinks import explanations, replacing
 from pipeline.sinks.findings import Strong, answer
 from pipeline.sinks.markup import Html, element, join, json_for_script, script_text
 from pipeline.sinks.page_style import draw_script, style_sheet, themed
-from pipeline.sinks.report_sections import comparison_section, floor_section, modes_section, sensor_section
+from pipeline.sinks.report_sections import (
+    closed_loop_section,
+    comparison_section,
+    floor_section,
+    modes_section,
+    sensor_section,
+)
 from pipeline.sinks.report_table import benchmark_table, column_table
 from pipeline.sinks.words import plural
 
@@ -115,6 +121,7 @@ def _body(table: Table, sections: Mapping[str, list[Html]], provenance: Provenan
         sensor_section(table),
         modes_section(table),
         comparison_section(table),
+        closed_loop_section(table),
         element("div", sections["policies"], class_="figures"),
         element(
             "section",

@@ -17,7 +17,9 @@ Table = Mapping[str, Any]
 
 MOST_LINES = 12
 """A longer table is folded away under a line that says what it holds."""
-METRICS = {"first_step_mae": "first action", "at_one_second_mae": "one second ahead"}
+METRICS = {
+    "first_step_mae": "first action", "at_one_second_mae": "one second ahead", "success": "success", "score": "score",
+}  # fmt: skip
 
 
 def verdict(word: str | None) -> Html | str:
@@ -221,6 +223,33 @@ def comparison_section(table: Table) -> Html | None:
         element("h2", "Which differences are real?"),
         element("p", said),
         _table(caption, heads, rows, summary),
+    )
+
+
+def closed_loop_section(table: Table) -> Html | None:
+    """Every comparison in closed loop; None where fewer than two policies were rolled out."""
+    comparisons = (table.get("closed_loop") or {}).get("comparisons")
+    if not comparisons:
+        return None
+    heads = ["Policy", "Against", "Verdict", "Difference", "p, Holm", "Seen from", "In words"]
+    several = any((row["rollouts"] or {}).get("seeds", 1) > 1 for row in table["policies"])
+    how = (
+        "Of each start state the mean over training seeds is compared: the difference must stand out over start states, and over "
+        "seeds too. "
+        if several
+        else "One network of each is compared, its success by McNemar's exact test; nothing is said of other training seeds. "
+    )
+    said = (
+        f"{findings.driven_family_words(table)} Every policy acts from the same start states, which stand here for episodes. "
+        f"{how}“Cannot tell” does not mean equal."
+    )
+    rows = [_comparison_row(table, comparison) for comparison in comparisons]
+    caption = "Difference of success rates (1 is 100 points) or scores, above zero where the policy is better; 95 % intervals."
+    return element(
+        "section",
+        element("h2", "Which policies do better in closed loop?"),
+        element("p", said),
+        _table(caption, heads, rows, f"All {len(rows)} comparisons in closed loop: {_tally(comparisons)}"),
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from pipeline.sinks.findings import MARKS, address, champion, first_step_gap, gap_parts, is_seen, ranks
+from pipeline.sinks.findings import MARKS, address, champion, driven_word, first_step_gap, gap_parts, is_seen, ranks
 from pipeline.sinks.markup import Html, element, join
 from pipeline.sinks.palette import is_baseline
 from pipeline.sinks.report_sections import verdict
@@ -84,8 +84,14 @@ def _columns(table: Mapping[str, Any]) -> list[Column]:
     ]  # fmt: skip
     if any(row["rollouts"] for row in table["policies"]):
         columns += [
-            Column("Success", "95 % interval", lambda row: _of(row, "success"), "high", _success),
-            Column("Score", "best reward", lambda row: _of(row, "score"), "high", None, 3),
+            Column(
+                "Success",
+                "95 % interval, tested",
+                lambda row: _of(row, "success"),
+                "high",
+                lambda row, _: _with_verdict(_success(row), driven_word(table, address(row))),
+            ),
+            Column("Score", "best reward", lambda row: _of(row, "score"), "high", _score, 3),
             *_stepped_in(table),
         ]
     return [
@@ -188,12 +194,17 @@ def _with_interval(row: Row, shown: str, scale: float) -> Html:
     return join(element("b", shown), " ", element("small", text, class_="beside") if text else None, picture)
 
 
-def _success(row: Row, _: str) -> Html:
+def _score(row: Row, shown: str) -> Html:
+    text = show_interval(row["rollouts"].get("score_interval"), 3)
+    return join(element("b", shown), element("small", text) if text else None)
+
+
+def _success(row: Row) -> Html:
     rollouts = row["rollouts"]
-    done = round(rollouts["success"] * rollouts["n"])
+    done = round(rollouts["success"] * rollouts["episodes"])
     interval = rollouts.get("success_interval")
     text = f"{100 * interval[0]:.0f}–{100 * interval[1]:.0f} %" if show_interval(interval) else ""
-    return join(element("b", f"{done}/{rollouts['n']}"), element("small", text))
+    return join(element("b", f"{done}/{rollouts['episodes']}"), element("small", text))
 
 
 def _stepped_in(table: Mapping[str, Any]) -> list[Column]:

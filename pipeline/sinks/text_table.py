@@ -15,6 +15,8 @@ from pipeline.sinks.findings import (
     answer,
     champion,
     deadline_words,
+    driven_family_words,
+    driven_word,
     driven_words,
     elsewhere_words,
     excluded_words,
@@ -25,6 +27,7 @@ from pipeline.sinks.findings import (
     is_elsewhere,
     is_seen,
     not_held,
+    success_words,
     without_floor,
 )
 
@@ -178,7 +181,10 @@ def _columns(table: Mapping[str, Any], unit: str | None) -> list[_Column]:
         _Column(head, number(key), way) for key, head, way in optional if any(row[key] is not None for row in rows)
     ]
     if any(row["rollouts"] for row in rows):
-        columns += [_Column("success", _success), _Column("score", score, 12)]
+        columns += [
+            _Column("success", lambda row: _success(row, driven_word(table, address(row)))),
+            _Column("score", score, 12),
+        ]
     return [
         *columns,
         _Column("params", lambda row: f"{row['params']:,}" if row["params"] else "—", 3),
@@ -248,13 +254,15 @@ def _with_interval(value: float | None, interval: Sequence[float] | None) -> str
     return f"{shown} [dim]{_number(interval[0], 3)}–{_number(interval[1], 3)}[/]" if interval else shown
 
 
-def _success(row: Mapping[str, Any]) -> str:
+def _success(row: Mapping[str, Any], word: str | None) -> str:
+    """The rate, its interval, and the mark of its verdict in closed loop."""
     rollouts = row["rollouts"]
     if not rollouts:
         return "—"
     interval = rollouts.get("success_interval")
     value = f"{100 * rollouts['success']:.0f} %"
-    return f"{value} [dim]{100 * interval[0]:.0f}–{100 * interval[1]:.0f}[/]" if interval else value
+    value += f" [dim]{100 * interval[0]:.0f}–{100 * interval[1]:.0f}[/]" if interval else ""
+    return f"{value} {_verdict(word, mark_only=True)}" if word else value
 
 
 def _common_unit(units: Sequence[str | None]) -> str | None:
@@ -276,9 +284,10 @@ def _footnotes(table: Mapping[str, Any]) -> list[str]:
             f"against: paired tests over episodes and seeds, {families_words(table)} ✓ better, ✗ worse, ? cannot tell; "
             "at 1 s: against hold-still"
         )
-    if any(row["rollouts"] for row in table["policies"]):
-        trials = max(row["rollouts"]["n"] for row in table["policies"] if row["rollouts"])
-        lines.append(f"success: {trials} start states, one network, Clopper–Pearson 95 % · score: mean best reward")
+    if words := success_words(table):
+        lines.append(f"success: {words} · score: mean best reward")
+    if words := driven_family_words(table):
+        lines.append(f"closed loop: {words}")
     lines += [*driven_words(table), *deadline_words(table)]
     if any(first_step_gap(row) for row in table["policies"]):
         lines.append(

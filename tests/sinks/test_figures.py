@@ -165,7 +165,7 @@ def test_no_crowded_neighbourhood_no_figure(demos, semantics, floor):
 def test_rollouts_show_the_policy_that_succeeds_most(demos, rollouts):
     worse = replace(rollouts, policy="mlp_k01", success=np.zeros(6, bool))
     figure = rollout_figure([worse, rollouts], demos)
-    assert figure.reading.startswith("mlp_k04 (state) drives by itself in the simulator pusht 0.1.8 from 6")
+    assert figure.reading.startswith("mlp_k04 (state, seed 0) drives by itself in the simulator pusht 0.1.8 from 6")
     assert figure.reading.endswith("Task done in 4.")
     assert rollout_figure([replace(rollouts, paths=None)], demos) is None
 
