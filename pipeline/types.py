@@ -330,7 +330,8 @@ class Rollouts:
     stages        [R, G] bool, which stages of the task each episode came to; None where the simulator has none
     stage_names   [G], earliest first
     execution     how its chunks were carried out
-    interventions [R] frames in which the safety layer passed something else on than was asked for
+    interventions [R] frames in which the safety layer stepped in (`safety.Guard` says when)
+    corrections   [R] the sum over those frames of how far it changed what was asked for, in ranges of a column
     stopped       [R] why it stopped the robot (`safety.RUNS`: it did not)
     seed          the training seed; 0 of what is not trained
     """
@@ -349,6 +350,7 @@ class Rollouts:
     stage_names: tuple[str, ...] = ()
     execution: Execution = AS_USUAL
     interventions: np.ndarray | None = None
+    corrections: np.ndarray | None = None
     stopped: np.ndarray | None = None
     seed: int = 0
 

@@ -1,15 +1,20 @@
 """The safety layer: whatever goes in, no output breaks a limit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.config import SafetyConfig, parse_config
+from pipeline.embedded import embedded_folder
 from pipeline.errors import ConfigError
-from pipeline.safety import NOT_FINITE, REPEATED, RUNS, Guard, Limits, Workspace, tighter
+from pipeline.lerobot_format.read import read_dataset
+from pipeline.safety import NOT_FINITE, REPEATED, RUNS, TOLERANCE, Guard, Limits, Workspace, tighter
+from pipeline.simulate.pusht import PushT
 from pipeline.simulate.so101 import SO101
-from pipeline.types import ACTION, Feature
+from pipeline.types import ACTION, STATE, Feature
 
 NAMES = ("a", "b")
 ANY = st.one_of(
@@ -96,6 +101,75 @@ def test_what_is_within_passes_untouched():
         asked = np.array([action], np.float32)
         np.testing.assert_array_equal(guard(asked, np.array([True])), asked)
     assert guard.interventions.tolist() == [0]
+
+
+@settings(max_examples=200, deadline=None)
+@given(a_robot())
+def test_what_is_counted_is_what_changed_an_action_by_more_than_the_tolerance(robot):
+    """Against the plain definition, frame by frame; how far it was changed is summed over what is counted."""
+    limits, start, asked = robot
+    limits = limits_of(limits.low, limits.high, limits.per_frame)
+    guard, ranges = Guard(limits, start), limits.ranges
+    for actions in asked:
+        before, sums, running = guard.interventions.copy(), guard.corrections.copy(), guard.stopped == RUNS
+        passed = guard(actions, np.ones(3, bool))
+        with np.errstate(over="ignore"):
+            wanted = actions.astype(np.float32).astype(float)
+        for i in np.flatnonzero(running):
+            finite = np.isfinite(wanted[i]).all()
+            far = max(abs(passed[i] - wanted[i]) / ranges) if finite else 0.0
+            assert guard.interventions[i] - before[i] == (far > 0.01 or not finite)
+            sums[i] += far if far > 0.01 else 0.0
+        np.testing.assert_allclose(guard.corrections, sums, rtol=1e-12)
+    assert (guard.interventions <= len(asked)).all()
+
+
+@settings(max_examples=200, deadline=None)
+@given(a_robot())
+def test_the_count_does_not_move_a_limit(robot):
+    """What is passed on is the same whether the change is counted or not: it keeps the limits to the last bit."""
+    limits, start, _ = robot
+    # Frame after frame a hair further than may be.
+    hair = np.nextafter(np.float32(limits.high), np.float32(np.inf)).astype(float)
+    guard = Guard(replace(limits, per_frame=np.full(2, np.inf)), start)
+    check(guard, guard.limits, np.tile(hair, (4, 3, 1)))
+    assert (guard.previous.astype(float) <= limits.high).all()
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "per_frame", "expected"),
+    [
+        ([-100, 0], [100, 100], [np.inf, np.inf], [200, 100]),
+        ([-100, 0], [100, 100], [10, 50], [100, 100]),
+        ([-np.inf, -np.inf], [np.inf, 5], [3, np.inf], [30, 1]),
+        ([2, 2], [2, 2], [np.inf, 3], [1, 1]),
+    ],
+    ids=["low to high", "ten frames where that is less", "no finite range", "a column that is held"],
+)
+def test_a_column_s_range_is_what_it_can_reach(low, high, per_frame, expected):
+    assert limits_of(low, high, per_frame).ranges.tolist() == expected
+
+
+def test_a_gripper_held_at_its_limit_is_no_intervention():
+    """Asked to close a hair further than it can: held exactly, not counted, and it does not stop the robot."""
+    limits = limits_of([0, 0], [100, 100], [np.inf, np.inf], stop_after=2)
+    guard, one = Guard(limits, np.array([[50.0, 0.0]])), np.array([True])
+    for _ in range(50):
+        np.testing.assert_array_equal(guard(np.array([[50.0, -100 * TOLERANCE]]), one), [[50, 0]])
+    assert (guard.interventions.tolist(), guard.corrections.tolist(), guard.stopped.tolist()) == ([0], [0], [RUNS])
+    for _ in range(2):
+        guard(np.array([[50.0, -4.0]]), one)
+    assert (guard.interventions.tolist(), guard.stopped.tolist()) == ([2], [REPEATED])
+    assert guard.corrections[0] == pytest.approx(0.08)
+
+
+@pytest.mark.parametrize(("name", "simulator"), [("so101_sim", SO101), ("pusht_sim", PushT)])
+def test_followers_are_further_than_the_tolerance_from_their_leaders(name, simulator):
+    """The reason for the tolerance, in every column of the demonstrations: a robot is not where it is told to be."""
+    demos, ranges = read_dataset(embedded_folder(name), name=name), simulator().limits().ranges
+    behind = np.abs(demos.columns[ACTION] - demos.columns[STATE]).mean(axis=0) / ranges
+    assert (behind > TOLERANCE).all()
+    assert behind.max() < 10 * TOLERANCE
 
 
 def test_a_speed_limit_is_measured_from_what_was_passed_on():

@@ -17,6 +17,8 @@ from demobench.commands.trained import Found, find_trained
 from pipeline.errors import ConfigError
 from pipeline.execution import settled
 from pipeline.experiment import parse_numbers
+from pipeline.safety import TOLERANCE
+from pipeline.sinks.words import percent
 from pipeline.types import Execution
 
 
@@ -123,16 +125,16 @@ def _show(
         soft_wrap=True,
     )
     table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    for head in ("policy", "chunk", "executed", "delay", "success", "95 %", "score", "stepped\nin", "stopped"):
+    for head in ("policy", "chunk", "executed", "delay", "success", "95 %", "score", "stepped\nin", "by", "stopped"):
         table.add_column(head, no_wrap=True, justify="left" if head == "policy" else "right")
     for row in rows:
         interval = row["success_interval"]
-        how = row["execution"]
+        how, size = row["execution"], row["mean_intervention"]
         table.add_row(
             escape(row["policy"]), str(row["chunk"]), "ensemble" if how["ensemble"] else str(how["execute"]),
             str(how["delay"]), f"[bold]{row['successes']}/{row['episodes']}[/]",
             f"{100 * interval[0]:.0f}–{100 * interval[1]:.0f} %" if interval else "—",
-            f"{row['score']:.3f}", f"{100 * row['intervened']:.2g} %", str(row["stopped"]),
+            f"{row['score']:.3f}", percent(row["intervened"]), "—" if size is None else percent(size), str(row["stopped"]),
         )  # fmt: skip
     console.print(table)
     for policy in dict.fromkeys(one["policy"] for one in left_out):
@@ -143,7 +145,8 @@ def _show(
             soft_wrap=True,
         )
     console.print(
-        "Stepped in: the share of frames in which the safety layer passed something else on; stopped: episodes that it ended.\n"
+        f"Stepped in: the share of frames in which the safety layer changed an action by more than {percent(TOLERANCE)} of a "
+        "column's range; by: how far on average, in ranges; stopped: episodes that it ended.\n"
         f"Intervals ({_intervals(rows[0])}) are of each row alone: the best of many is partly luck. Roll it out again from "
         "start states that chose nothing (--from).",
         style="dim",

@@ -180,6 +180,7 @@ class _Episode:
             "best_coverage": self._best_coverage,
             "steps": self._steps,
             "interventions": self._guard.interventions,
+            "corrections": self._guard.corrections,
             "stopped": self._guard.stopped,
             "paths": np.stack(self._path, axis=1),
         }

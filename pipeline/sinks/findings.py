@@ -11,7 +11,8 @@ from typing import Any
 from pipeline.execution import settled
 from pipeline.execution import words as execution_words
 from pipeline.methods import EXTERNAL, METHODS
-from pipeline.sinks.words import common_unit, decimals_for, is_number, plural, show, show_interval
+from pipeline.safety import TOLERANCE
+from pipeline.sinks.words import common_unit, decimals_for, is_number, percent, plural, show, show_interval
 from pipeline.types import AS_USUAL, Execution
 
 Table = Mapping[str, Any]
@@ -167,19 +168,23 @@ def deadline_words(table: Table) -> list[str]:
 
 
 def _safety_words(table: Table) -> list[str]:
-    """How often the safety layer stepped in, policy by policy; nothing where it did not have to."""
+    """How often the safety layer stepped in and how far, policy by policy; nothing where it did not have to."""
     rows = [row for row in table["policies"] if (row["rollouts"] or {}).get("interventions")]
     if not rows:
         return []
     words = [f"{name_in(table, address(row))} {_stepped_in(row['rollouts'])}" for row in rows]
-    return [f"the safety layer stepped in (share of the frames): {', '.join(words)}"]
+    least = percent(TOLERANCE)
+    return [
+        f"the safety layer stepped in (it changed an action by more than {least} of a column's range): {'; '.join(words)}"
+    ]
 
 
 def _stepped_in(rollouts: Mapping[str, Any]) -> str:
     share, stopped, broken = (rollouts[name] for name in ("intervened", "stopped", "stopped_not_finite"))
+    size = rollouts.get("mean_intervention")
     why = f", {broken} for actions that are not finite" if broken else ""
-    small = f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
-    return f"{small} ({stopped} of {rollouts['episodes']} episodes stopped{why})" if stopped else small
+    said = f"in {percent(share)} of the frames" + (f", by {percent(size)} on average" if is_number(size) else "")
+    return f"{said} ({stopped} of {rollouts['episodes']} episodes stopped{why})" if stopped else said
 
 
 def _samples_words(scores: Mapping[str, Any], unit: str) -> str:

@@ -12,7 +12,7 @@ from pipeline.sinks.findings import MARKS, address, champion, driven_word, first
 from pipeline.sinks.markup import Html, element, join
 from pipeline.sinks.palette import is_baseline
 from pipeline.sinks.report_sections import verdict
-from pipeline.sinks.words import DASH, common_unit, decimals_for, is_number, show, show_interval
+from pipeline.sinks.words import DASH, common_unit, decimals_for, is_number, percent, show, show_interval
 
 Row = Mapping[str, Any]
 
@@ -216,7 +216,11 @@ def _stepped_in(table: Mapping[str, Any]) -> list[Column]:
         found = _of(row, "intervened")
         return None if found is None else 100 * found
 
-    return [Column("Safety", "stepped in, % of frames", share, None, None, 2)]
+    def by_how_much(row: Row, shown: str) -> Html | str:
+        size = _of(row, "mean_intervention")
+        return join(shown, element("small", f"by {percent(size)} of a range")) if is_number(size) else shown
+
+    return [Column("Safety", "stepped in, % of frames", share, None, by_how_much, 2)]
 
 
 def _late(row: Row, shown: str) -> Html | str:

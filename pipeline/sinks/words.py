@@ -43,3 +43,8 @@ def common_unit(units: Sequence[str | None]) -> str | None:
 
 def plural(count: int, word: str) -> str:
     return f"{count:,} {word}{'' if count == 1 else 's'}"
+
+
+def percent(share: float) -> str:
+    """`0.34 %`, `12 %`: two digits below a tenth, whole per cents above."""
+    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:,.0f} %"

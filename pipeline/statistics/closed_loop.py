@@ -134,12 +134,26 @@ def _reach_of_seeds(mean: float, values: np.ndarray) -> tuple[float, float]:
 
 
 def _safety(rollouts: Sequence[Rollouts]) -> dict[str, Any]:
-    """What the safety layer did: frames in which it stepped in, as a number and a share, and episodes that it stopped."""
+    """What the safety layer did: frames in which it stepped in, as a number and a share, how far it changed an action then (a
+    mean, in ranges of a column; None where it changed none that was finite), and episodes that it stopped."""
     count, frames = (int(sum(getattr(one, name).sum() for one in rollouts)) for name in ("interventions", "steps"))
     ended = np.concatenate([one.stopped for one in rollouts])
     stopped, not_finite = int((ended != RUNS).sum()), int((ended == NOT_FINITE).sum())
     share = count / max(frames + stopped, 1)
-    return {"interventions": count, "intervened": share, "stopped": stopped, "stopped_not_finite": not_finite}
+    # Each action that is not finite ends an episode, so there are as many as episodes that they ended.
+    finite = count - not_finite
+    size = (
+        sum(float(one.corrections.sum()) for one in rollouts) / finite
+        if finite and rollouts[0].corrections is not None
+        else None
+    )
+    return {
+        "interventions": count,
+        "intervened": share,
+        "mean_intervention": size,
+        "stopped": stopped,
+        "stopped_not_finite": not_finite,
+    }
 
 
 # Two policies ---------------------------------------------------------------------------------------------------------

@@ -205,7 +205,7 @@ def test_actions_are_clipped_to_the_action_space():
 
 
 def test_the_safety_layer_counts_and_stops():
-    """The first keeps its limits; the second does so for 4 frames; the third is NaN from its second question on."""
+    """The first keeps its limits; the second breaks them in half of its chunks; the third is NaN from its second question on."""
 
     class Odd(Creeper):
         def predict(self, observations):
@@ -216,7 +216,9 @@ def test_the_safety_layer_counts_and_stops():
 
     limits = replace(Line().limits(), high=np.array([0.9]))
     results = rollout(Odd(step=0.001), Line(), SET, [0, 1, 2], name="o", history=1, limits=limits, batch=3)
-    assert results.interventions.tolist() == [0, 16, 1]
+    assert results.interventions.tolist() == [0, 8, 1]
+    # Of a range of 1.9, in the frames that ask for 9. Once it is there it asks for 0.901: held at 0.9, and no intervention.
+    np.testing.assert_allclose(results.corrections, [0, 8 * (9 - 0.9) / 1.9, 0])
     assert results.stopped.tolist() == [RUNS, RUNS, NOT_FINITE]
     assert results.steps.tolist() == [20, 20, 8]
     assert results.success.tolist() == [False] * 3

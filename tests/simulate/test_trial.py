@@ -24,7 +24,7 @@ def rolled(**changes) -> Rollouts:
         {},
         {
             "execution": Execution(1, ensemble=True, delay=1), "interventions": np.array([0, 3, 1]),
-            "stopped": np.array([0, 0, 1]),
+            "corrections": np.array([0, 0.5, 0.02]), "stopped": np.array([0, 0, 1]),
         },
         {
             "simulator": "so101", "best_coverage": np.full(3, np.nan), "paths": None, "stage_names": ("near", "done"),

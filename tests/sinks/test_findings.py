@@ -57,11 +57,17 @@ def test_what_the_safety_layer_did_and_why_there_are_no_roll_outs_is_said(table)
     rolled = next(row for row in table["policies"] if row["rollouts"])["rollouts"]
     rolled |= {"interventions": 0, "intervened": 0.0, "stopped": 0, "stopped_not_finite": 0}
     assert driven_words(table) == []
-    rolled |= {"interventions": 30, "intervened": 0.0123, "stopped": 4, "stopped_not_finite": 3}
+    rolled |= {
+        "interventions": 30,
+        "intervened": 0.0123,
+        "mean_intervention": 0.0345,
+        "stopped": 4,
+        "stopped_not_finite": 3,
+    }
     table["policies"][0]["no_rollouts"] = "it does not fit"
     assert driven_words(table) == [
-        "the safety layer stepped in (share of the frames): mlp_k04 1.2 % (4 of 50 episodes stopped, 3 for actions that are not "
-        "finite)",
+        "the safety layer stepped in (it changed an action by more than 1 % of a column's range): mlp_k04 in 1.2 % of the frames, "
+        "by 3.5 % on average (4 of 50 episodes stopped, 3 for actions that are not finite)",
         "no roll-outs of mlp_k01: it does not fit",
     ]
 

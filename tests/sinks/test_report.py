@@ -108,7 +108,7 @@ def test_what_is_behind_closed_loop_numbers_is_said(table, figures):
     for row, why in zip(table["policies"], ("it does not fit", None, None), strict=True):
         row["no_rollouts"] = why
     table["policies"][1]["rollouts"] |= {
-        "interventions": 9, "intervened": 0.0123, "stopped": 0, "stopped_not_finite": 0,
+        "interventions": 9, "intervened": 0.0123, "mean_intervention": 0.25, "stopped": 0, "stopped_not_finite": 0,
     }  # fmt: skip
     table["policies"][1] |= {
         "latency_p99_ms": 250.0, "deadline_ms": 100.0, "misses_deadline": True,
@@ -116,7 +116,7 @@ def test_what_is_behind_closed_loop_numbers_is_said(table, figures):
     }  # fmt: skip
     page = text_of(render_report(table, figures, PROVENANCE))
     assert "stepped in, % of frames" in page
-    assert "1.23" in page
+    assert "1.23 by 25 % of a range" in page
     assert "99 %: 250.000, misses its deadline" in page
     assert "One call in a hundred of mlp_k04 takes 250 ms or more on this machine, and it is asked every 100 ms" in page
     assert "No roll-outs of mlp_k01: it does not fit." in page

@@ -1,6 +1,7 @@
 """Roll-outs in short, with and without stages."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,12 +31,17 @@ def test_what_the_safety_layer_did_is_counted():
     guarded = rolled(
         np.array([0.96, 0.5]),
         interventions=np.array([3, 0]),
+        corrections=np.array([0.5, 0.0]),
         stopped=np.array([NOT_FINITE, RUNS]),
         execution=Execution(4),
     )
     summary = summarise_rollouts([guarded])
     assert (summary["interventions"], summary["stopped"], summary["stopped_not_finite"]) == (3, 1, 1)
     assert summary["intervened"] == 3 / (9 + 20 + 1)
+    # One of the three was an action that is not finite: it has no size.
+    assert summary["mean_intervention"] == 0.25
+    untouched = replace(guarded, interventions=np.array([1, 0]), corrections=np.zeros(2))
+    assert summarise_rollouts(untouched)["mean_intervention"] is None
     assert summary["execution"] == {"execute": 4, "ensemble": False, "delay": 0}
     assert "interventions" not in summarise_rollouts([rolled(np.array([0.96, 0.5]))])
 
