@@ -41,7 +41,7 @@ def test_what_the_safety_layer_did_is_counted():
     # One of the three was an action that is not finite: it has no size.
     assert summary["mean_intervention"] == 0.25
     untouched = replace(guarded, interventions=np.array([1, 0]), corrections=np.zeros(2))
-    assert summarise_rollouts(untouched)["mean_intervention"] is None
+    assert summarise_rollouts([untouched])["mean_intervention"] is None
     assert summary["execution"] == {"execute": 4, "ensemble": False, "delay": 0}
     assert "interventions" not in summarise_rollouts([rolled(np.array([0.96, 0.5]))])
 
