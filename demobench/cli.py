@@ -251,6 +251,9 @@ def rollouts(
     ] = None,
     delay: Annotated[str | None, typer.Option(help="Frames from a question to its answer: 0,2")] = None,
     ensemble: Annotated[bool, typer.Option("--ensemble", help="Also (or only) as a temporal ensemble.")] = False,
+    carry_on: Annotated[
+        bool, typer.Option("--carry-on", help="Also so that an answer goes on where the robot has not moved.")
+    ] = False,
     seeds: Annotated[
         int | None, typer.Option(min=1, help="Training seeds, at most those trained; else as the configuration says.")
     ] = None,
@@ -267,7 +270,7 @@ def rollouts(
     from demobench.commands.rollouts import run_rollouts
 
     run_rollouts(
-        address, execute=execute, delay=delay, ensemble=ensemble, seeds=seeds, starts=starts, first=first,
+        address, execute=execute, delay=delay, ensemble=ensemble, carry_on=carry_on, seeds=seeds, starts=starts, first=first,
         config_path=config, store_path=store, json_to=json_to,
     )  # fmt: skip
 

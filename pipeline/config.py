@@ -208,6 +208,7 @@ class PolicyConfig(Settings):
     execute: Annotated[int, Field(ge=1, le=10_000)] | None = None
     ensemble: bool = False
     delay: Annotated[int, Field(ge=0, le=10_000)] = 0
+    carry_on: bool = False
 
     optional = frozenset(
         {
@@ -221,6 +222,7 @@ class PolicyConfig(Settings):
             "execute",
             "ensemble",
             "delay",
+            "carry_on",
         }
     )
 
@@ -241,7 +243,7 @@ class PolicyConfig(Settings):
     @property
     def execution(self) -> Execution:
         """How its chunks are carried out in roll-outs; training does not depend on it."""
-        return Execution(self.execute, self.ensemble, self.delay)
+        return Execution(self.execute, self.ensemble, self.delay, self.carry_on)
 
     @property
     def view(self) -> dict[str, Any]:
@@ -403,7 +405,9 @@ def _check_execution(policy: PolicyConfig) -> None:
     if policy.execution == AS_USUAL:
         return
     if not METHODS[policy.method].trained:
-        raise ConfigError("execute, ensemble and delay are for policies that are trained, and baselines are not.")
+        raise ConfigError(
+            "execute, ensemble, delay and carry_on are for policies that are trained, and baselines are not."
+        )
     for chunk in sorted(policy.chunks) or [1]:
         settled(policy.execution, chunk)
 

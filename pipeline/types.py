@@ -310,11 +310,13 @@ class Execution:
     execute   actions carried out of each chunk before the policy is asked again; None: the usual 8, or as many as there are
     ensemble  the policy is asked at every frame, and what all answers say of a frame is averaged
     delay     frames from a question to its answer
+    carry_on  where the robot has not moved since the last question, the answer to that one goes on
     """
 
     execute: int | None = None
     ensemble: bool = False
     delay: int = 0
+    carry_on: bool = False
 
 
 AS_USUAL = Execution()

@@ -31,6 +31,7 @@ def test_what_is_not_said_is_as_usual_or_what_the_chunk_has(chunk, asked, execut
     [
         (4, Execution(8), "execute = 8 needs a chunk of at least 8 actions, and this one has 4"),
         (16, Execution(4, ensemble=True), "execute = 4 and ensemble contradict each other"),
+        (16, Execution(ensemble=True, carry_on=True), "ensemble and carry_on contradict each other"),
         (4, Execution(delay=4), "delay = 4, and a chunk of 4 actions is over before its first action can begin"),
         (8, Execution(7, delay=2), "execute = 7 after a delay of 2 needs a chunk of at least 9 actions"),
         (16, Execution(2, delay=3), "delay = 3 is longer than the 2 frames between two questions"),
@@ -47,6 +48,7 @@ def test_words():
     assert words(Execution(1)) == "1 action of each chunk"
     assert words(Execution(8, delay=2)) == "8 actions of each chunk, 2 frames late"
     assert words(Execution(1, ensemble=True, delay=1)) == "a temporal ensemble, 1 frame late"
+    assert words(Execution(4, carry_on=True)) == "4 actions of each chunk, carried on where the robot stands still"
 
 
 FILE = """

@@ -28,6 +28,7 @@ def run_rollouts(
     execute: str | None,
     delay: str | None,
     ensemble: bool,
+    carry_on: bool,
     seeds: int | None,
     starts: int,
     first: int | None,
@@ -46,7 +47,7 @@ def run_rollouts(
     from pipeline.statistics.closed_loop import summarise_rollouts
 
     session = open_session(config_path, store_path, json_to)
-    asked = _asked(parse_numbers("--execute", execute, 1), parse_numbers("--delay", delay, 0), ensemble)
+    asked = _asked(parse_numbers("--execute", execute, 1), parse_numbers("--delay", delay, 0), ensemble, carry_on)
     found = find_trained(address, session)
     first = found[0].task.experiment.start_states.stop if first is None else first
     trained = found[0].task.experiment.seeds
@@ -69,13 +70,14 @@ def run_rollouts(
     write_json_to(json_to, said)
 
 
-def _asked(executes: Sequence[int], delays: Sequence[int], ensemble: bool) -> list[Execution | None]:
+def _asked(executes: Sequence[int], delays: Sequence[int], ensemble: bool, carry_on: bool) -> list[Execution | None]:
     """Every way that is asked for; None alone: as the configuration says."""
-    if not (executes or delays or ensemble):
+    if not (executes or delays or ensemble or carry_on):
         return [None]
-    plain = [Execution(e, False, d) for e, d in product(executes or (None,), delays or (0,))]
-    return (plain if executes or not ensemble else []) + [
-        Execution(None, True, d) for d in (delays or (0,)) if ensemble
+    late = delays or (0,)
+    plain = [Execution(e, False, d, on) for e, d in product(executes or (None,), late) for on in {False, carry_on}]
+    return (plain if executes or carry_on or not ensemble else []) + [
+        Execution(None, True, d) for d in late if ensemble
     ]
 
 
@@ -108,7 +110,7 @@ def _bar(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
 
 def _how(execution: Execution) -> str:
     how = "ensemble" if execution.ensemble else f"{execution.execute} executed"
-    return f"{how}, delay {execution.delay}"
+    return f"{how}, delay {execution.delay}{', carried on' if execution.carry_on else ''}"
 
 
 def _show(

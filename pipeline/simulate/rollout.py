@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from pipeline.errors import PolicyError
-from pipeline.execution import settled
+from pipeline.execution import STILL, settled
 from pipeline.predict import average_answers
 from pipeline.safety import NOT_FINITE, RUNS, Guard, Limits
 from pipeline.simulate import Environments, Simulator
@@ -100,7 +100,7 @@ class _Episode:
         self._features, self._name = observation_set.features, name
         self._environments: Environments = simulator.start(numbers)
         rows, columns = len(numbers), len(limits.names)
-        self._standing = self._environments.standing()
+        self._standing = self._stood = self._environments.standing()
         self._guard = Guard(limits, self._standing)
         self._seen = [self._environments.observe()] * history
         self._previous = np.full((rows, columns), np.nan, dtype=np.float32)
@@ -117,8 +117,9 @@ class _Episode:
     def run(self, policy, execution: Execution, circular: np.ndarray | None, limit: int) -> Iterator[int]:
         """To the end of all environments; gives the frame before every question but the first, and the last one."""
         while self.running.any() and self.frame < limit:
-            self._answers.append((self.frame, self.ask(policy)))
-            self.execution = settled(execution, self._answers[-1][1].shape[1])
+            answer = self.ask(policy)
+            self.execution = settled(execution, answer.shape[1])
+            self._answers.append((self.frame, self.carried_on(answer) if execution.carry_on else answer))
             for _ in range(min(self.execution.execute, limit - self.frame)):
                 if self.running.any():
                     self.act(self.due(circular))
@@ -136,6 +137,16 @@ class _Episode:
     def _said_of_now(self) -> list[tuple[int, np.ndarray]]:
         """When each answer was asked for, oldest first, and what it says of this frame [R, A]."""
         return [(asked, chunk[:, self.frame - asked]) for asked, chunk in self._answers]
+
+    def carried_on(self, answer: np.ndarray) -> np.ndarray:
+        """[R, K, A] the new answer, or what is left of the last one where the robot still stands where it was asked then."""
+        stood, self._stood = self._stood, self._environments.standing()
+        if not self._answers:
+            return answer
+        still = (np.abs(self._stood - stood) <= STILL * self._guard.limits.ranges).all(axis=1)
+        asked, before = self._answers[-1]
+        gone = np.minimum(np.arange(answer.shape[1]) + self.frame - asked, answer.shape[1] - 1)
+        return np.where(still[:, None, None], before[:, gone], answer)
 
     def ask(self, policy) -> np.ndarray:
         """[R, K, A] the policy's chunk for every environment, finished ones included."""

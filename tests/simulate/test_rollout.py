@@ -184,6 +184,57 @@ def test_the_robot_stands_still_until_the_first_answer_is_there():
     np.testing.assert_allclose(results.paths[0, :6, 0], [0.3, 0.3, 0.3, 0.3, 0.7, 0.8], atol=1e-6)
 
 
+@dataclass
+class Waiter:
+    """Waits for `wait` frames where it is, and goes on then: asked again before that, it never does."""
+
+    wait: int = 6
+
+    def predict(self, observations: Observations) -> np.ndarray:
+        ahead = 0.1 * np.maximum(np.arange(10, dtype=np.float32) + 1 - self.wait, 0)
+        return (observations.values[:, -1, None, :1] + ahead[:, None])[None]
+
+
+def test_a_pause_ends_only_where_the_answer_goes_on():
+    for carry_on in (False, True):
+        how = Execution(4, carry_on=carry_on)
+        results = rollout(Waiter(), Line(), SET, [0, 95, -90], name="w", history=1, execution=how, batch=3)
+        if not carry_on:
+            np.testing.assert_allclose(results.paths[..., 0], np.tile([[0], [0.95], [-0.9]], 21), atol=1e-6)
+        else:
+            # Asked at 0; at 4 it has not moved, so actions 4 to 7 of that answer act; then it has moved and is asked anew.
+            first = np.array([0, 0, 0, 0, 0, 0, 0, 0.1, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.3, 0.4])
+            np.testing.assert_allclose(results.paths[0, :17, 0], first, atol=1e-6)
+            np.testing.assert_allclose(results.paths[2, :17, 0], first - 0.9, atol=1e-6)
+            assert results.steps.tolist() == [20, 7, 20]
+        assert results.execution == how
+
+
+def test_an_answer_that_is_over_ends_in_its_last_action():
+    """Behind an obstacle nothing moves: the answer runs out and its last action stays, the policy is not asked in vain."""
+
+    class Wall(_Points):
+        def step(self, actions, running):
+            return super().step(np.minimum(actions, 0.5), running)
+
+    class Walled(Line):
+        def start(self, numbers):
+            return Wall(np.asarray(numbers, dtype=np.float64)[:, None] / 100, True)
+
+    results = rollout(
+        Creeper(step=0.2, chunk=6),
+        Walled(),
+        SET,
+        [0],
+        name="c",
+        history=1,
+        execution=Execution(2, carry_on=True),
+        batch=1,
+    )
+    np.testing.assert_allclose(results.paths[0, :5, 0], [0, 0.2, 0.4, 0.5, 0.5], atol=1e-6)
+    np.testing.assert_allclose(results.paths[0, 5:, 0], 0.5, atol=1e-6)
+
+
 def test_a_chunk_that_cannot_be_carried_out_like_that_is_refused():
     with pytest.raises(ConfigError, match="execute = 9 needs a chunk of at least 9 actions, and this one has 4"):
         rollout(Creeper(chunk=4), Line(), SET, [0], name="c", history=1, execution=Execution(9))
