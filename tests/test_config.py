@@ -53,6 +53,8 @@ def test_shipped_file_is_the_built_in_default():
             ["[policies.a] width is 30"],
         ),
         ({"benchmark": {"seeds": 0}}, ["benchmark.seeds", "greater than or equal to 1"]),
+        ({"benchmark": {"seeds": 2, "rollout_seeds": 3}}, ["rollout_seeds is 3 and seeds is 2", "lower rollout_seeds"]),
+        ({"benchmark": {"rollouts_from": -1}}, ["benchmark.rollouts_from", "greater than or equal to 0"]),
         ({"benchmark": {"protocol": "loose"}}, ["benchmark.protocol", "'strict' or 'notebook'"]),
         (
             {"policies": {"mlp": {"method": "mlp", "chunks": [1], "observations": ["stat"]}}},

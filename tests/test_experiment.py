@@ -136,3 +136,35 @@ def test_a_data_set_is_found_by_its_short_name_as_long_as_there_is_one():
     assert known_as("nothing", config, ["tape+1234abcd"]) == "nothing"
     with pytest.raises(ConfigError, match=r"several settings: tape\+a, tape\+b. Name one"):
         known_as("tape", config, ["tape+b", "tape+a"])
+
+
+# Closed loop ----------------------------------------------------------------------------------------------------------
+
+
+def test_where_and_with_how_many_seeds_policies_are_rolled_out():
+    found = target(rollouts=9, rollout_seeds=2).experiment
+    assert (found.start_states, found.rollout_seeds) == (range(9), 2)
+    assert target(rollouts=9).key.startswith("tape+")
+    later = parse_config(
+        {"benchmark": {"rollouts": 5, "rollouts_from": 1000}, "datasets": {"x": {"source": "x"}}}, "test"
+    )
+    assert resolve_target("x", later, HERE, Choices(), {}).experiment.start_states == range(1000, 1005)
+
+
+def test_no_more_seeds_are_rolled_out_than_are_trained():
+    with pytest.raises(ConfigError, match="rollout_seeds is 6 and seeds is 5: only what is trained can be rolled out"):
+        target(rollout_seeds=6)
+    three = parse_config({"benchmark": {"rollout_seeds": 3}, "datasets": {"x": {"source": "x"}}}, "test")
+    found = resolve_target("x", three, HERE, Choices(seeds=2), {}).experiment
+    assert (found.seeds, found.rollout_seeds) == (2, 2), "fewer seeds on the command line are fewer everywhere"
+
+
+def test_experiments_that_were_stored_before_there_were_seeds_to_roll_out_are_the_same():
+    stored = target().experiment.model_dump(mode="json")
+    assert not {"rollout_seeds", "rollouts_from"} & set(stored)
+    assert target("tape", {"tape": stored}).experiment == target().experiment
+
+
+def test_what_is_trained_is_rolled_out_and_of_the_rest_hold_still():
+    driven = {v.name for v in target().experiment.variants if v.is_rolled_out}
+    assert driven == {"hold_still", "mlp_k01", "mlp_k16"}

@@ -9,11 +9,22 @@ from rich.console import Console
 
 from pipeline.sinks.explanations import facts
 from pipeline.sinks.text_table import render_table
+from pipeline.statistics.closed_loop import summarise_rollouts
 from pipeline.statistics.floors import measure_floors
 from pipeline.statistics.radius import radius_floor
 from pipeline.table import build_table, dataset_json, floor_json, json_safe
+from pipeline.types import Rollouts
 from tests.hand_made import STATE_ONLY, random_walks, semantics
-from tests.sinks.making import make_comparison, make_demos, make_gap, make_semantics, make_table, make_verdict
+from tests.sinks.making import (
+    make_closed_loop,
+    make_comparison,
+    make_demos,
+    make_driven,
+    make_gap,
+    make_semantics,
+    make_table,
+    make_verdict,
+)  # fmt: skip
 from tests.statistics.test_metrics import scored, task_of
 
 ROLLOUTS = {
@@ -202,6 +213,54 @@ def test_verdicts_and_distances_to_floors_stand_beside_the_numbers():
     assert "8.000 ✗" in rows["mlp_k04"]
     assert "at the floor ±0.800" in rows["hold_still"]
     assert "It cannot be told from the second, mlp_k04: needs more." in lines
+
+
+def test_verdicts_in_closed_loop_stand_beside_success():
+    demos = make_demos()
+    table = make_table(demos, make_semantics(demos))
+    table["dataset"]["warnings"] = []
+    table["policies"][0]["rollouts"] = table["policies"][1]["rollouts"] | {
+        "success": 0.4,
+        "success_interval": [0.27, 0.55],
+    }
+    worse = make_driven("mlp_k01/state", "mlp_k04/state", "worse", "worse")
+    table["closed_loop"] = make_closed_loop(*worse, family=2)
+    text = drawn(table, 200)
+    assert "40 % 27–55 ✗" in text
+    assert "closed loop: 2 comparisons in a family of their own, against mlp_k04, which does best" in text
+    assert "success: 50 start states, one network (seed 0 of fold 0), Clopper–Pearson 95 % · score" in text
+
+
+@pytest.mark.parametrize(("champion", "chosen", "family"), [(None, "best", 6), ("mlp_k01", "champion", 4)])
+def test_the_table_judges_what_was_rolled_out(table, tmp_path, champion, chosen, family):
+    """Three rows of the real table, rolled out by hand: half, all and none of forty."""
+    demos = random_walks((50,) * 6, units={"action": ("px", "px")})
+    succeed = {"mlp_k01": np.arange(40) < 20, "mlp_k32": np.arange(40) < 40, "hold_still": np.arange(40) < 0}
+    entries = []
+    for variant, success in succeed.items():
+        task = task_of(demos, variant)
+        (tmp_path / variant).mkdir()
+        score, _ = scored(task, tmp_path / variant)
+        rolled = [
+            Rollouts(
+                "any", "1", variant, "state", np.arange(40), success, success * 1.0, success * 1.0, np.full(40, 9), None
+            )
+        ]
+        entries.append({
+            "variant": task.variant, "observations": "state", "metrics": score.metrics, "windows_train": 240,
+            "windows_test": 60, "errors": score.errors, "latency_ms": 0.1, "parameters": 7 * task.variant.is_trained,
+            "train_s": 1.5, "rollouts": summarise_rollouts(rolled), "rolled_out": rolled,
+        })  # fmt: skip
+    dataset = task.experiment.dataset.model_copy(update={"champion": champion})
+    experiment = task.experiment.model_copy(update={"dataset": dataset})
+    found = build_table(facts_of(demos, semantics(demos)), experiment, task.split, [], [], entries)["closed_loop"]
+    assert (found["chosen"], found["family"]) == (chosen, family)
+    words = {(c["a"], c["metric"]): c["word"] for c in found["comparisons"]}
+    rest = ("mlp_k32/state", "better") if champion else ("mlp_k01/state", "worse")
+    assert words == {
+        (rest[0], "success"): rest[1], (rest[0], "score"): rest[1],
+        ("hold_still/state", "success"): "worse", ("hold_still/state", "score"): "worse",
+    }  # fmt: skip
 
 
 def test_names_are_never_markup_in_a_sentence():

@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,9 +22,10 @@ from pipeline.simulate.trial import roll_out
 from pipeline.store import Store
 from pipeline.types import Execution
 from tests.assets_defs.conftest import TinyBenchmark
+from tests.demobench.test_cli import demobench
 
 RAW = {
-    "benchmark": {"seeds": 1, "steps": 3, "rollouts": 2, "threads": 1},
+    "benchmark": {"seeds": 2, "steps": 3, "rollouts": 2, "threads": 1},
     "datasets": {
         "tiny": {
             "simulator": "pusht", "kind": "position", "circular": ["block_angle_rad"], "exclude": list(range(8, 200)),
@@ -66,8 +68,8 @@ def session(made, monkeypatch, tmp_path) -> Session:
 
 def roll(address, **asked):
     options = {
-        "execute": None, "delay": None, "ensemble": False, "starts": 3, "first": None, "config_path": None, "store_path": None,
-        "json_to": None,
+        "execute": None, "delay": None, "ensemble": False, "seeds": None, "starts": 3, "first": None, "config_path": None,
+        "store_path": None, "json_to": None,
     }  # fmt: skip
     run_rollouts(address, **options | asked)
 
@@ -101,6 +103,22 @@ def test_left_alone_it_is_as_the_configuration_says(session, made, tmp_path):
     assert rolled.best_reward.mean() == row["score"]
 
 
+def test_several_seeds_act_from_the_same_start_states(session, tmp_path):
+    said = tmp_path / "said.json"
+    roll("tiny/mlp_k16/pose", seeds=2, first=0, starts=3, json_to=str(said))
+    (row,) = json.loads(said.read_text())["rows"]
+    assert (row["seeds"], row["n"], row["episodes"]) == (2, 3, 6)
+    (one,) = find_trained("tiny/mlp_k16/pose", session)
+    first, second = roll_out(one.task, one.folder, seeds=2, start_states=range(3))
+    assert (first.seed, second.seed, first.start_states.tolist()) == (0, 1, second.start_states.tolist())
+    assert (first.best_reward != second.best_reward).any(), "two networks, not one twice"
+    (alone,) = roll_out(one.task, one.folder, start_states=range(3))
+    np.testing.assert_array_equal(alone.best_reward, first.best_reward)
+    assert row["score"] == pytest.approx(np.mean([first.best_reward, second.best_reward]))
+    assert [one["seed"] for one in row["per_seed"]] == [0, 1]
+    assert "seeds 0 to 1 of fold 0" in session.console.export_text()
+
+
 @pytest.mark.parametrize(
     ("address", "options", "error", "message"),
     [
@@ -118,6 +136,12 @@ def test_left_alone_it_is_as_the_configuration_says(session, made, tmp_path):
         ("tiny/late_k04/pose", {}, StoreError, "no up-to-date weights of late_k04.*demobench run tiny --policies late"),
         ("tiny/mlp_k04/pose", {"execute": "5"}, ConfigError, "mlp_k04: execute = 5 needs a chunk of at least 5"),
         ("tiny/mlp_k04/pose", {"execute": "0"}, ConfigError, "--execute takes whole numbers of at least 1"),
+        (
+            "tiny/mlp_k04/pose",
+            {"seeds": 3},
+            ConfigError,
+            "--seeds is 3, and mlp_k04 was trained with 2: ask for at most",
+        ),
         ("tiny/mlp_k04/pose", {"delay": "x"}, ConfigError, "--delay takes whole numbers of at least 0"),
     ],
 )
@@ -151,7 +175,7 @@ def test_a_network_of_the_store_as_a_file(session, tmp_path):
         ("tiny/mlp/pose", "a.onnx", 0, "stands for several policies: mlp_k04, mlp_k16. Export one of them"),
         ("tiny/mlp_k04/pose", "a.txt", 0, "is no place for an ONNX file. Name one that ends in .onnx"),
         ("tiny/mlp_k04/pose", "no/a.onnx", 0, "in a folder that exists"),
-        ("tiny/mlp_k04/pose", "a.onnx", 1, "mlp_k04 has no seed 1. Its seeds are 0"),
+        ("tiny/mlp_k04/pose", "a.onnx", 2, "mlp_k04 has no seed 2. Its seeds are 0, 1"),
         ("tiny/hold_still", "a.onnx", 0, "is a baseline"),
     ],
 )
@@ -234,3 +258,55 @@ def test_one_policy_that_cannot_be_rolled_out_leaves_the_others(made):
     assert outcome.summary["rollouts"] is None
     assert "'mlp_k04' answered with NaN or infinite actions in a roll-out" in outcome.summary["why_not"]
     assert outcome.checks["sane"][0]
+
+
+# The whole way ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_two_seeds_from_the_command_line_to_verdicts(tmp_path):
+    """A real run on a few demonstrations of PushT: two seeds and hold-still in closed loop, judged, compared, rolled out again."""
+    left_out = list(range(8, 200))
+    (tmp_path / "demobench.toml").write_text(
+        f"""
+        [benchmark]
+        seeds = 2
+        steps = 20
+        rollouts = 6
+        rollouts_from = 100
+        rollout_seeds = 2
+        threads = 1
+        [datasets.tape]
+        source = "embedded:pusht_sim"
+        simulator = "pusht"
+        kind = "position"
+        circular = ["block_angle_rad"]
+        observations = {{pose = ["observation.state", "observation.environment_state"]}}
+        exclude = {left_out}
+        [policies.mlp]
+        method = "mlp"
+        chunks = [4, 16]
+        """
+    )
+    run = demobench("run", "tape", "--json", "out.json", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    (table,) = json.loads((tmp_path / "out.json").read_text())
+    rolled = {row["policy"]: row["rollouts"] for row in table["policies"] if row["rollouts"]}
+    assert {name: (one["seeds"], one["first"], one["n"]) for name, one in rolled.items()} == {
+        "hold_still": (1, 100, 6), "mlp_k04": (2, 100, 6), "mlp_k16": (2, 100, 6),
+    }  # fmt: skip
+    found = table["closed_loop"]
+    assert found["chosen"] == "best"
+    assert {c["metric"] for c in found["comparisons"]} == {"success", "score"}
+    assert len(found["comparisons"]) == 2 * 2
+    assert "6 start states × 2 seeds of fold 0, 95 % over both" in run.stdout
+    assert "closed loop: " in run.stdout
+    assert "Which policies do better in closed loop?" in Path(tmp_path / table["artifacts"]["report"]).read_text()
+    words = ("--from", "100", "--starts", "6", "--json", "-")
+    again = demobench("rollouts", "tape/mlp_k04/pose", "--seeds", "2", *words, cwd=tmp_path)
+    (row,) = json.loads(again.stdout)["rows"]
+    assert {key: row[key] for key in rolled["mlp_k04"]} == rolled["mlp_k04"]
+    pairs = json.loads(demobench("compare", "tape", "--json", "-", cwd=tmp_path).stdout)["comparisons"]
+    driven = [pair for pair in pairs if pair["metric"] in ("success", "score")]
+    assert len(driven) == 2 * 3, "all pairs of the three that were rolled out"
+    assert demobench("run", "tape", cwd=tmp_path).stdout.count("nothing to compute") == 1

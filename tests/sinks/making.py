@@ -106,6 +106,20 @@ def make_comparison(a: str, b: str, word: str = "better", **more) -> dict:
     return named | numbers | {"needs_episodes": None, "words": "error 78 % lower"} | more
 
 
+def make_closed_loop(*comparisons: dict, chosen: str = "best", family: int = 6) -> dict:
+    """`closed_loop` of `run --json`: against the row that the comparisons are with."""
+    return {"reference": comparisons[0]["b"], "chosen": chosen, "family": family, "comparisons": list(comparisons)}
+
+
+def make_driven(a: str, b: str, success: str, score: str, **more) -> list[dict]:
+    """Two comparisons in closed loop; their numbers are made up."""
+    words = {"better": "0.3 higher", "worse": "0.3 lower", "cannot tell": "about 120 start states would show it"}
+    return [
+        make_comparison(a, b, word, metric=metric, words=words[word], difference=-0.3, interval=[-0.45, -0.15], **more)
+        for metric, word in (("success", success), ("score", score))
+    ]
+
+
 def make_floor(loss: str = "rmse", **more) -> dict:
     """A floor of `run --json`: one number in squared error, a span in absolute error."""
     numbers = {"value": 4.0, "upper": None, "interval": [3.6, 4.4]}

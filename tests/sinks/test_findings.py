@@ -8,6 +8,8 @@ from pipeline.sinks.findings import (
     answer,
     champion,
     deadline_words,
+    driven_family_words,
+    driven_word,
     driven_words,
     family,
     gap_parts,
@@ -15,10 +17,21 @@ from pipeline.sinks.findings import (
     interval_words,
     limit_words,
     name_in,
+    success_words,
     without_floor,
 )
 
-from .making import make_bracket, make_comparison, make_floor, make_gap, make_refusal, make_row, make_verdict
+from .making import (
+    make_bracket,
+    make_closed_loop,
+    make_comparison,
+    make_driven,
+    make_floor,
+    make_gap,
+    make_refusal,
+    make_row,
+    make_verdict,
+)  # fmt: skip
 
 
 def said(table) -> list[str]:
@@ -234,3 +247,49 @@ def test_how_intervals_were_made(table):
     for row in table["policies"]:
         row |= {"interval": {"first_step_mae": None}, "interval_method": None}
     assert interval_words(table) == "no interval below 5 held-out episodes"
+
+
+# Closed loop ----------------------------------------------------------------------------------------------------------
+
+
+def test_verdicts_in_closed_loop_are_against_whoever_does_best_there(table):
+    worse = make_driven("mlp_k01/state", "mlp_k04/state", "worse", "worse")
+    table["closed_loop"] = make_closed_loop(*worse, *make_driven("hold_still/state", "mlp_k04/state", "worse", "worse"))
+    assert said(table)[-1] == "Against it in closed loop – success and score: worse: mlp_k01 and hold_still."
+    unsure = make_driven("mlp_k01/state", "mlp_k04/state", "cannot tell", "worse", needs_episodes=120)
+    table["closed_loop"] = make_closed_loop(
+        *unsure, *make_driven("hold_still/state", "mlp_k04/state", "worse", "worse")
+    )
+    assert said(table)[-1] == (
+        "Against it in closed loop – success: cannot tell: mlp_k01 (it would take about 120 start states); worse: hold_still. "
+        "Score: worse: mlp_k01 and hold_still."
+    )
+    assert driven_family_words(table).startswith(
+        "6 comparisons in a family of their own, against mlp_k04, which does best from"
+    )
+    assert "all pairs count" in driven_family_words(table)
+    assert driven_word(table, "mlp_k01/state") == "cannot tell"
+    assert driven_word(table, "mlp_k04/state") is None
+
+
+def test_verdicts_in_closed_loop_are_against_the_champion_where_it_was_rolled_out(table):
+    better = make_driven("mlp_k04/state", "mlp_k01/state", "better", "better")
+    table["closed_loop"] = make_closed_loop(*better, chosen="champion", family=2)
+    assert said(table)[-1] == "In closed loop, against the champion mlp_k01 – success and score: better: mlp_k04."
+    assert driven_family_words(table).startswith(
+        "2 comparisons in a family of their own, against the champion, mlp_k01;"
+    )
+
+
+def test_nothing_is_said_of_seeds_that_were_not_rolled_out(table):
+    rolled = next(row for row in table["policies"] if row["rollouts"])["rollouts"]
+    assert success_words(table) == "50 start states, one network (seed 0 of fold 0), Clopper–Pearson 95 %"
+    rolled |= {"seeds": 3, "episodes": 150}
+    assert success_words(table) == "50 start states × 3 seeds of fold 0, 95 % over both"
+    assert said(table)[-1] == (
+        "In closed loop mlp_k04 seeing state succeeds most often: 123 of 150 (69–91 %), 3 training seeds from 50 start states."
+    )
+    for row in table["policies"]:
+        row["rollouts"] = None
+    assert success_words(table) == ""
+    assert driven_family_words(table) == ""

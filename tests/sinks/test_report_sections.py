@@ -5,9 +5,24 @@ import re
 
 import pytest
 
-from pipeline.sinks.report_sections import MOST_LINES, comparison_section, floor_section, sensor_section, verdict
+from pipeline.sinks.report_sections import (
+    MOST_LINES,
+    closed_loop_section,
+    comparison_section,
+    floor_section,
+    sensor_section,
+    verdict,
+)  # fmt: skip
 
-from .making import make_bracket, make_comparison, make_floor, make_refusal, make_sensor
+from .making import (
+    make_bracket,
+    make_closed_loop,
+    make_comparison,
+    make_driven,
+    make_floor,
+    make_refusal,
+    make_sensor,
+)  # fmt: skip
 
 
 def words_of(section: str) -> str:
@@ -84,6 +99,20 @@ def test_what_cannot_be_compared_says_why(table):
     text = words_of(comparison_section(table))
     assert "No difference was tested: a verdict needs at least five held-out episodes." in text
     assert text.endswith("a first action gone – not comparable – – – Split differs: 1a and 2b")
+
+
+def test_closed_loop_has_a_family_of_its_own(table):
+    assert closed_loop_section(table) is None
+    table["closed_loop"] = make_closed_loop(*make_driven("mlp_k01/state", "mlp_k04/state", "worse", "cannot tell"))
+    text = words_of(closed_loop_section(table))
+    assert (
+        "6 comparisons in a family of their own, against mlp_k04, which does best from these very start states" in text
+    )
+    assert "One network of each is compared, its success by McNemar's exact test" in text
+    assert "mlp_k01 success mlp_k04 ✗ worse −0.300 [−0.450, −0.150] 0.002 1.50 0.3 lower" in text
+    assert "mlp_k01 score mlp_k04 ? cannot tell" in text
+    table["policies"][1]["rollouts"]["seeds"] = 3
+    assert "Of each start state the mean over training seeds is compared" in words_of(closed_loop_section(table))
 
 
 def test_long_tables_are_folded_away(table):
