@@ -49,7 +49,10 @@ def answer(table: Table) -> list[Sentence]:
         found += [*_against_champion(table, rows), *_first_step_floor(table, best), *_later_floor(table, best)]
     found += [_from_elsewhere(table, row) for row in table["policies"] if is_elsewhere(row)]
     driven = [row for row in table["policies"] if row["rollouts"]]
-    return [*found, _best_driven(driven), *_driven_verdicts(table)] if driven else found
+    if not driven:
+        return found
+    most = max(driven, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]))
+    return [*found, _best_driven(most), *_driven_verdicts(table, most)]
 
 
 def excluded_words(table: Table) -> str:
@@ -293,8 +296,7 @@ def _second(table: Table, rows: Sequence[Row], best: Row) -> list[Sentence]:
     return [["Whether it is better than the second, ", name, f", is not tested here; demobench compare {both} tells."]]
 
 
-def _best_driven(rows: Sequence[Row]) -> Sentence:
-    most = max(rows, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]))
+def _best_driven(most: Row) -> Sentence:
     n, rate, interval = most["rollouts"]["n"], most["rollouts"]["success"], most["rollouts"].get("success_interval")
     if rate == 0:
         none = f"In closed loop no policy succeeds from any of {n} start states; the highest score is that of "
@@ -315,18 +317,19 @@ def _how_far(row: Row) -> Sentence:
     return [f" Of its {rollouts['episodes']} roll-outs: {', '.join(counts)}."]
 
 
-def _driven_verdicts(table: Table) -> list[Sentence]:
-    """Who does better in closed loop than the champion, or than whoever does best there."""
-    found = table.get("closed_loop")
-    if not found or not found["comparisons"]:
+def _driven_verdicts(table: Table, most: Row) -> list[Sentence]:
+    """Who of the rows shown does better in closed loop than the champion, or than whoever does best there."""
+    found, shown = table.get("closed_loop"), {address(row) for row in table["policies"]}
+    comparisons = [c for c in (found or {}).get("comparisons", ()) if c["a"] in shown]
+    if not comparisons:
         return []
-    success, score = (
-        _driven_groups(table, [c for c in found["comparisons"] if c["metric"] == metric]) for metric in DRIVEN
-    )
+    success, score = (_driven_groups(table, [c for c in comparisons if c["metric"] == metric]) for metric in DRIVEN)
     said = f"success and score: {success}" if success == score else f"success: {success}. Score: {score}"
+    named = Strong(name_in(table, found["reference"]))
     if found["chosen"] == "champion":
-        named = Strong(name_in(table, found["reference"]))
         return [["In closed loop, against the champion ", named, f" – {said}."]]
+    if found["reference"] != address(most):  # a run that was asked for some policies shows only those
+        return [["Against ", named, f", which does best in closed loop of all there is – {said}."]]
     return [["Against it in closed loop – ", f"{said}."]]
 
 

@@ -218,9 +218,15 @@ def log_scores(
 
 
 def log_rollouts(uri: str, run_id: str, summary: Mapping[str, Any]) -> None:
-    """Add closed-loop results: `rollout_success`, `rollout_score` and their limits."""
+    """Add closed-loop results: `rollout_success`, `rollout_score` and their limits; each seed's own to its nested run."""
     with _client(uri) as client:
         _send(client, run_id, _series({f"rollout_{name}": value for name, value in summary.items()}))
+        if summary["seeds"] > 1:
+            children = _children(client, run_id)
+            for one in summary["per_seed"]:
+                own = {"rollout_success": one["successes"] / summary["n"], "rollout_score": one["score"]}
+                if str(one["seed"]) in children:
+                    _send(client, children[str(one["seed"])], _series(own))
 
 
 def log_curve(uri: str, run_id: str, sizes: Sequence[Mapping[str, Any]]) -> None:

@@ -263,6 +263,16 @@ def test_one_policy_that_cannot_be_rolled_out_leaves_the_others(made):
 # The whole way ------------------------------------------------------------------------------------------------------------
 
 
+def seed_metrics(uri: str, name: str) -> dict[str, float]:
+    """What MLflow holds of one training seed."""
+    from mlflow import MlflowClient
+
+    client = MlflowClient(tracking_uri=uri)
+    experiments = [experiment.experiment_id for experiment in client.search_experiments()]
+    (run,) = client.search_runs(experiments, f"attributes.run_name = '{name}'")
+    return run.data.metrics
+
+
 @pytest.mark.slow
 def test_two_seeds_from_the_command_line_to_verdicts(tmp_path):
     """A real run on a few demonstrations of PushT: two seeds and hold-still in closed loop, judged, compared, rolled out again."""
@@ -302,6 +312,8 @@ def test_two_seeds_from_the_command_line_to_verdicts(tmp_path):
     assert "6 start states × 2 seeds of fold 0, 95 % over both" in run.stdout
     assert "closed loop: " in run.stdout
     assert "Which policies do better in closed loop?" in Path(tmp_path / table["artifacts"]["report"]).read_text()
+    tracked = seed_metrics(table["artifacts"]["mlflow"], "mlp_k04/pose/seed_1")
+    assert tracked["rollout_score"] == pytest.approx(rolled["mlp_k04"]["per_seed"][1]["score"])
     words = ("--from", "100", "--starts", "6", "--json", "-")
     again = demobench("rollouts", "tape/mlp_k04/pose", "--seeds", "2", *words, cwd=tmp_path)
     (row,) = json.loads(again.stdout)["rows"]

@@ -272,6 +272,14 @@ def test_verdicts_in_closed_loop_are_against_whoever_does_best_there(table):
     assert driven_word(table, "mlp_k04/state") is None
 
 
+def test_where_the_best_in_closed_loop_is_not_shown_it_is_named(table):
+    worse = make_driven("mlp_k04/state", "act_k16/state", "worse", "worse")
+    table["closed_loop"] = make_closed_loop(*worse, *make_driven("gone/state", "act_k16/state", "worse", "worse"))
+    assert said(table)[-1] == (
+        "Against act_k16, which does best in closed loop of all there is – success and score: worse: mlp_k04."
+    )
+
+
 def test_verdicts_in_closed_loop_are_against_the_champion_where_it_was_rolled_out(table):
     better = make_driven("mlp_k04/state", "mlp_k01/state", "better", "better")
     table["closed_loop"] = make_closed_loop(*better, chosen="champion", family=2)
