@@ -75,7 +75,9 @@ def _asked(executes: Sequence[int], delays: Sequence[int], ensemble: bool, carry
     if not (executes or delays or ensemble or carry_on):
         return [None]
     late = delays or (0,)
-    plain = [Execution(e, False, d, on) for e, d in product(executes or (None,), late) for on in {False, carry_on}]
+    plain = [
+        Execution(e, False, d, on) for e, d in product(executes or (None,), late) for on in sorted({False, carry_on})
+    ]
     return (plain if executes or carry_on or not ensemble else []) + [
         Execution(None, True, d) for d in late if ensemble
     ]

@@ -68,7 +68,8 @@ def session(made, monkeypatch, tmp_path) -> Session:
 
 def roll(address, **asked):
     options = {
-        "execute": None, "delay": None, "ensemble": False, "seeds": None, "starts": 3, "first": None, "config_path": None,
+        "execute": None, "delay": None, "ensemble": False, "carry_on": False, "seeds": None, "starts": 3, "first": None,
+        "config_path": None,
         "store_path": None, "json_to": None,
     }  # fmt: skip
     run_rollouts(address, **options | asked)
@@ -78,7 +79,8 @@ def test_every_chunk_in_every_way_it_allows(session, tmp_path):
     said = tmp_path / "said.json"
     roll("tiny/mlp/pose", execute="2,8", delay="0,1", ensemble=True, json_to=str(said))
     found = json.loads(said.read_text())
-    ways = [(row["chunk"], *row["execution"].values()) for row in found["rows"]]
+    keys = ("execute", "ensemble", "delay")
+    ways = [(row["chunk"], *(row["execution"][key] for key in keys)) for row in found["rows"]]
     assert ways == [
         (4, 2, False, 0), (4, 2, False, 1), (4, 1, True, 0), (4, 1, True, 1),
         (16, 2, False, 0), (16, 2, False, 1), (16, 8, False, 0), (16, 8, False, 1), (16, 1, True, 0), (16, 1, True, 1),
@@ -92,11 +94,18 @@ def test_every_chunk_in_every_way_it_allows(session, tmp_path):
     assert "0/3" in shown
 
 
+def test_carried_on_stands_beside_not_carried_on(session, tmp_path):
+    said = tmp_path / "said.json"
+    roll("tiny/mlp_k04/pose", execute="2", carry_on=True, json_to=str(said))
+    ways = [(row["execution"]["execute"], row["execution"]["carry_on"]) for row in json.loads(said.read_text())["rows"]]
+    assert ways == [(2, False), (2, True)]
+
+
 def test_left_alone_it_is_as_the_configuration_says(session, made, tmp_path):
     said = tmp_path / "said.json"
     roll("tiny/mlp_k16/pose", first=0, starts=2, json_to=str(said))
     (row,) = json.loads(said.read_text())["rows"]
-    assert row["execution"] == {"execute": 4, "ensemble": False, "delay": 0}
+    assert row["execution"] == {"execute": 4, "ensemble": False, "delay": 0, "carry_on": False}
     (one,) = find_trained("tiny/mlp_k16/pose", session)
     (rolled,) = roll_out(one.task, one.folder)
     assert (rolled.execution, rolled.seed) == (Execution(4), 0)
