@@ -323,6 +323,20 @@ AS_USUAL = Execution()
 
 
 @dataclass(frozen=True)
+class Scenes:
+    """What there was to see of the first few roll-outs, and what the policy meant to do: enough to draw them again.
+
+    shown   feature key → [S, L, D] float32, all that the simulator shows of a frame (NaN after the end)
+    asked   [Q] frames at which the policy was asked
+    chunks  [S, Q, K, A] float32, what it answered then (NaN after the end)
+    """
+
+    shown: Mapping[str, np.ndarray]
+    asked: np.ndarray
+    chunks: np.ndarray
+
+
+@dataclass(frozen=True)
 class Rollouts:
     """Closed-loop results of one network (one training seed of fold 0) from numbered start states.
 
@@ -336,6 +350,7 @@ class Rollouts:
     corrections   [R] the sum over those frames of how far it changed what was asked for, in ranges of a column
     stopped       [R] why it stopped the robot (`safety.RUNS`: it did not)
     seed          the training seed; 0 of what is not trained
+    scenes        of the first few start states, to draw them again; None where they were not kept
     """
 
     simulator: str
@@ -355,6 +370,7 @@ class Rollouts:
     corrections: np.ndarray | None = None
     stopped: np.ndarray | None = None
     seed: int = 0
+    scenes: Scenes | None = None
 
     @property
     def stage_counts(self) -> list[int]:

@@ -13,11 +13,15 @@ from pipeline.execution import STILL, settled
 from pipeline.predict import average_answers
 from pipeline.safety import NOT_FINITE, RUNS, Guard, Limits
 from pipeline.simulate import Environments, Simulator
-from pipeline.types import AS_USUAL, STATE, Execution, Observations, ObservationSet, Rollouts
+from pipeline.types import AS_USUAL, STATE, Execution, Observations, ObservationSet, Rollouts, Scenes
 
 BATCH = 50
 """Environments that a policy is asked for together. Fixed: the size of a batch changes the last bits of a matrix
 product, and contacts turn them into different episodes."""
+SCENES = 8
+"""Of how many start states, the first ones, everything that is seen is usually kept: enough for a video, and small."""
+APART = 4
+"""Frames between two answers that are kept, at least: a policy that is asked at every frame says much the same again."""
 
 
 def rollout(
@@ -34,6 +38,7 @@ def rollout(
     limits: Limits | None = None,
     max_steps: int | None = None,
     batch: int = BATCH,
+    scenes: int = 0,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Rollouts:
     """Ask a policy, carry out what `execution` says of its chunk, ask again (`pipeline.execution` says when what acts).
@@ -50,6 +55,7 @@ def rollout(
         history: frames the policy is shown.
         circular: [A] bool, action columns that an ensemble averages as directions.
         limits: of the safety layer; the simulator's own if none are given.
+        scenes: of how many start states, the first ones, what there is to see is kept.
         on_frame: called with (frames done, frames at most), over all batches.
 
     Raises:
@@ -58,17 +64,19 @@ def rollout(
     """
     limit = simulator.max_steps if max_steps is None else max_steps
     numbers = list(start_states)
-    parts = []
+    parts, looked = [], []
     total = limit * -(-len(numbers) // batch)
     for first in range(0, len(numbers), batch):
         block = numbers[first : first + batch]
         padded = block + [block[-1]] * (batch - len(block))
-        episode = _Episode(simulator, observation_set, padded, history, name, limits or simulator.limits())
+        kept = min(max(scenes - first, 0), len(block))
+        episode = _Episode(simulator, observation_set, padded, history, name, limits or simulator.limits(), kept)
         episode.running[len(block) :] = False
         for frame in episode.run(policy, execution, circular, limit):
             if on_frame:
                 on_frame(len(parts) * limit + frame, total)
         parts.append({key: value[: len(block)] for key, value in episode.results().items()})
+        looked += [episode.scenes()] if kept else []
         stage_names, how = episode.stage_names, episode.execution
     results = _joined(parts)
     _require_answers(results, name, seed)
@@ -81,6 +89,7 @@ def rollout(
         stage_names=stage_names,
         execution=how,
         seed=seed,
+        scenes=_joined_scenes(looked) if looked else None,
         **results,
     )
 
@@ -96,6 +105,7 @@ class _Episode:
         history: int,
         name: str,
         limits: Limits,
+        scenes: int,
     ):
         self._features, self._name = observation_set.features, name
         self._environments: Environments = simulator.start(numbers)
@@ -111,6 +121,9 @@ class _Episode:
         self._stages: dict[str, np.ndarray] = {}
         self._steps = np.zeros(rows, dtype=np.int64)
         self._path = [self._where(self.running)]
+        self._scenes_kept = scenes
+        self._scenes = [self._look(self.running)]
+        self._kept: list[tuple[int, np.ndarray]] = []
         self._answers: deque[tuple[int, np.ndarray]] = deque()
         self.execution = AS_USUAL
 
@@ -160,7 +173,14 @@ class _Episode:
                 f"Policy '{self._name}' answered with shape {answer.shape} in a roll-out; expected "
                 f"[seeds, {rows}, chunk, {columns}]."
             )
+        self._keep(answer[0])
         return answer[0]
+
+    def _keep(self, answers: np.ndarray) -> None:
+        """Remember what the first environments were told, [R, K, A], unless that was done a moment ago."""
+        if not self._kept or self.frame - self._kept[-1][0] >= APART:
+            said = answers[: self._scenes_kept].astype(np.float32)
+            self._kept.append((self.frame, np.where(self.running[: len(said), None, None], said, np.nan)))
 
     def act(self, actions: np.ndarray) -> None:
         """One frame in every environment that still runs and is not stopped now; actions [R, A]."""
@@ -178,6 +198,7 @@ class _Episode:
         self._success |= ran & outcome.success
         self.running = ran & ~outcome.success
         self._path.append(self._where(ran))
+        self._scenes.append(self._look(ran))
 
     @property
     def stage_names(self) -> tuple[str, ...]:
@@ -195,6 +216,18 @@ class _Episode:
             "stopped": self._guard.stopped,
             "paths": np.stack(self._path, axis=1),
         }
+
+    def scenes(self) -> Scenes:
+        """What the first environments showed, and what the policy said it would do there."""
+        shown = {key: np.stack([scene[key] for scene in self._scenes], axis=1) for key in self._scenes[0]}
+        asked = np.array([frame for frame, _ in self._kept], dtype=np.int64)
+        return Scenes(shown, asked, np.stack([said for _, said in self._kept], axis=1))
+
+    def _look(self, moved: np.ndarray) -> dict[str, np.ndarray]:
+        """Feature key → [S, D] what is seen of the environments whose scenes are kept, NaN where it stood still."""
+        first = moved[: self._scenes_kept, None]
+        seen = {key: values[: len(first)] for key, values in self._seen[-1].items()}
+        return {key: np.where(first, values, np.nan).astype(np.float32) for key, values in seen.items()}
 
     def _where(self, moved: np.ndarray) -> np.ndarray:
         """[R, 2] where the end effector is, NaN where it stood still; [R, 0] where there is nothing to draw."""
@@ -216,9 +249,23 @@ def _require_answers(results: dict[str, np.ndarray | None], name: str, seed: int
 
 def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray | None]:
     """The batches one after another; paths are padded with NaN to the longest, and None where there is nothing in them."""
-    length = max(part["paths"].shape[1] for part in parts)
-    for part in parts:
-        missing = length - part["paths"].shape[1]
-        part["paths"] = np.pad(part["paths"], ((0, 0), (0, missing), (0, 0)), constant_values=np.nan)
-    joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    return joined if joined["paths"].shape[2] else joined | {"paths": None}
+    joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0] if key != "paths"}
+    paths = _end_to_end([part["paths"] for part in parts])
+    return joined | {"paths": paths if paths.shape[2] else None}
+
+
+def _joined_scenes(parts: list[Scenes]) -> Scenes:
+    """Those of the batches one after another; all were asked at the same frames, as far as they went."""
+    keys = parts[0].shown
+    shown = {key: _end_to_end([part.shown[key] for part in parts]) for key in keys}
+    asked = max((part.asked for part in parts), key=len)
+    return Scenes(shown, asked, _end_to_end([part.chunks for part in parts]))
+
+
+def _end_to_end(blocks: list[np.ndarray]) -> np.ndarray:
+    """Blocks [r, l, …] one after another, each padded with NaN to the longest."""
+    longest = max(block.shape[1] for block in blocks)
+    rest = [(0, 0)] * (blocks[0].ndim - 2)
+    return np.concatenate(
+        [np.pad(b, ((0, 0), (0, longest - b.shape[1]), *rest), constant_values=np.nan) for b in blocks]
+    )

@@ -1,7 +1,7 @@
 """A trained policy of a benchmark in its data set's simulator, and the files of what happened.
 
 What belongs here: from a task and a folder of weights to `Rollouts`, one a training seed. What does not: the loop itself
-(`rollout`), success rates and their intervals (`statistics.closed_loop`).
+(`rollout`), success rates and their intervals (`statistics.closed_loop`), what there was to see (`scene_files`).
 """
 
 import json
@@ -16,7 +16,8 @@ from pipeline.folds import PolicyTask, load_fold
 from pipeline.normalize import circular_columns
 from pipeline.safety import tighter
 from pipeline.simulate import simulator_for
-from pipeline.simulate.rollout import rollout
+from pipeline.simulate.rollout import SCENES, rollout
+from pipeline.simulate.scene_files import save_scenes
 from pipeline.types import ACTION, Execution, Rollouts
 
 TEXTS = ("simulator", "simulator_version", "policy", "observations")
@@ -63,6 +64,7 @@ def roll_out(
             execution=execution or task.policy.execution,
             limits=tighter(simulator.limits(), task.experiment.dataset.safety, task.demos.features[ACTION]),
             circular=circular_columns(task.demos, task.semantics, [ACTION]),
+            scenes=SCENES if position == 0 else 0,
             on_frame=on_frame and _counting_from(on_frame, position, len(chosen)),
         )
         for position, seed in enumerate(chosen)
@@ -82,7 +84,7 @@ def save_rollouts(rollouts: Sequence[Rollouts], folder: Path) -> None:
 
 
 def load_rollouts(folder: Path) -> list[Rollouts]:
-    """The inverse of `save_rollouts`, by seed."""
+    """The inverse of `save_rollouts`, by seed, without scenes (`scene_files.load_scenes`)."""
     return sorted((_load(place) for place in folder.glob("seed_*")), key=lambda one: one.seed)
 
 
@@ -90,13 +92,15 @@ def _save(rollouts: Rollouts, folder: Path) -> None:
     """Arrays as safetensors, words as JSON."""
     from safetensors.numpy import save_file
 
-    words_of = (*TEXTS, STAGE_NAMES, EXECUTION, SEED)
+    words_of = (*TEXTS, STAGE_NAMES, EXECUTION, SEED, "scenes")
     arrays = {f.name: getattr(rollouts, f.name) for f in fields(rollouts) if f.name not in words_of}
     present = {name: np.ascontiguousarray(array) for name, array in arrays.items() if array is not None}
     save_file(present, folder / "rollouts.safetensors")
     words = {name: getattr(rollouts, name) for name in (*TEXTS, SEED)} | {EXECUTION: asdict(rollouts.execution)}
     words |= {STAGE_NAMES: rollouts.stage_names} if rollouts.stage_names else {}
     (folder / "rollouts.json").write_text(json.dumps(words))
+    if rollouts.scenes is not None:
+        save_scenes(rollouts.scenes, folder)
 
 
 def _load(folder: Path) -> Rollouts:

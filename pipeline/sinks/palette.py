@@ -39,6 +39,16 @@ TRAINED = (
     Colour("#2f93cf", "#96d6ff"),  # sky blue
     Colour("#8f8500", "#f0e442"),  # yellow
 )
+ROLES = {
+    "ground": GRID,
+    "target": TRAINED[2],
+    "object": TRAINED[4],
+    "robot": TRAINED[0],
+    "way": MUTED,
+    "plan": TRAINED[1],
+}
+"""The things of a simulator, in a video and in Rerun (`simulate.scene`)."""
+
 BASELINES = {
     "hold_still": Colour("#6b7177", "#b4bac1"),
     "nearest_neighbour": Colour("#8a6d4b", "#c9ab87"),
