@@ -11,6 +11,7 @@ from assets_defs.curve import KEY as CURVE
 from assets_defs.curve import read_kept
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
 from assets_defs.floor import ESTIMATES
+from assets_defs.looking import VIDEO, driven_videos
 from assets_defs.plan import Unit
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import interval_words, picture, present, table
@@ -175,7 +176,7 @@ def _benchmark_report(benchmark_table: dg.AssetsDefinition) -> dg.AssetsDefiniti
         partitions_def=PARTITIONS,
         group_name="benchmark",
         kinds={"html", "altair"},
-        deps=[benchmark_table, CURVE],
+        deps=[benchmark_table, VIDEO, CURVE],
         code_version=code_version("benchmark_report"),
         check_specs=[check_spec(REPORT, "self_contained", "The page asks for nothing from the network.")],
     )
@@ -215,6 +216,7 @@ def _write_report(bench: Bench, draft) -> Outcome:
     from pipeline.sinks.markup import outside_references
     from pipeline.sinks.pictures import picture_table
     from pipeline.sinks.report import Provenance, write_report
+    from pipeline.sinks.report_video import Clip
     from pipeline.statistics.radius import load_floors
 
     plan = bench.plan
@@ -240,7 +242,8 @@ def _write_report(bench: Bench, draft) -> Outcome:
         warnings=tuple(bench.summary(Unit("demonstrations"))["inspect"]["warnings"]),
     )
     page = draft / "report.html"
-    write_report(page, built, figures, provenance)
+    clips = [Clip(video, path, path.with_suffix(".png")) for video, path in driven_videos(bench)]
+    write_report(page, built, figures, provenance, clips, bench.summary(Unit("rollout_video"))["left_out"])
     picture_table(built, draft / "errors.png")
     outside = outside_references(page)
     return Outcome(

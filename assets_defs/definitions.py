@@ -63,7 +63,7 @@ def build_defs(
         *curve_assets(predictions),
         *elsewhere_assets(),
         *benchmark_assets([*predictions, *rollouts, SCORED], floor.ASSETS),
-        *looking_assets([*predictions, SCORED]),
+        *looking_assets([*predictions, SCORED], rollouts),
     ]
     return dg.Definitions(
         assets=assets,

@@ -1,22 +1,30 @@
-"""Recordings: held-out episodes beside what every policy predicted, for MCAP readers and for Rerun."""
+"""What is looked at: held-out episodes beside what every policy predicted, for MCAP readers and for Rerun; roll-outs as a video."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import dagster as dg
 
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
 from assets_defs.plan import Unit
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
+from assets_defs.show import table
+
+if TYPE_CHECKING:
+    from pipeline.sinks.rollout_video import Video
+    from pipeline.types import Rollouts
 
 MCAP = dg.AssetKey(["mcap_log"])
 RERUN = dg.AssetKey(["rerun_recording"])
+VIDEO = dg.AssetKey(["rollout_video"])
 EPISODES = 10
 """How many held-out episodes a recording shows."""
 
 
-def looking_assets(deps: Sequence[dg.AssetKey]) -> list[dg.AssetsDefinition]:
-    """Both recordings; `deps` are the predictions of every policy."""
-    return [_mcap_log(deps), _rerun_recording(deps)]
+def looking_assets(deps: Sequence[dg.AssetKey], rollouts: Sequence[dg.AssetKey]) -> list[dg.AssetsDefinition]:
+    """Both recordings and the videos; `deps` are the predictions of every policy, `rollouts` its roll-outs."""
+    return [_rollout_video(rollouts), _mcap_log(deps), _rerun_recording([*deps, VIDEO])]
 
 
 def _held_out(bench: Bench) -> list[int]:
@@ -89,6 +97,98 @@ def _write_mcap(bench: Bench, draft) -> Outcome:
 
 def _recorded_ids(bench: Bench, episodes: list[int]) -> list[int]:
     return [int(bench.demonstrations.episode_ids[e]) for e in episodes]
+
+
+def _rollout_video(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
+    @dg.asset(
+        key=VIDEO,
+        partitions_def=PARTITIONS,
+        group_name="looking",
+        kinds={"h264"},
+        deps=[demonstrations, *deps],
+        code_version=code_version("rollout_video"),
+        check_specs=[check_spec(VIDEO, "whole", "Every frame that was written is in the file.")],
+    )
+    def rollout_video(
+        context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
+    ) -> dg.MaterializeResult:
+        """The policy that does best in closed loop, from the first few start states side by side: H.264, one an observation set.
+
+        There is none where the data set has no simulator, or nobody said how what it shows is drawn.
+        """
+        bench = workbench.open(context, budget)
+        unit = Unit("rollout_video")
+        made = bench.make(unit, lambda draft: _write_videos(bench, draft))
+        rows = [
+            (v["observations"], v["policy"], v["succeeded"], len(v["start_states"]), v["kb"])
+            for v in made.summary["videos"]
+        ]
+        rows += [(observations, why, None, None, None) for observations, why in made.summary["left_out"].items()]
+        header = ["observations", "policy", "succeeded", "start states", "kB"]
+        files = {v["observations"]: str(bench.plan.folder(unit) / v["file"]) for v in made.summary["videos"]}
+        metadata = {"videos": table(header, rows)} | {f"file_{k}": dg.MetadataValue.path(f) for k, f in files.items()}
+        return result(bench, VIDEO, {"": made}, metadata, ["whole"])
+
+    return rollout_video
+
+
+def _write_videos(bench: Bench, draft: Path) -> Outcome:
+    from pipeline.errors import NotApplicableError, StoreError
+    from pipeline.simulate.scene_files import load_scenes
+    from pipeline.sinks.rollout_video import count_frames, write_video
+
+    videos, left_out, found = [], {}, 0
+    for place, (unit, rollouts) in enumerate(_best_driven(bench)):
+        bench.progress(f"video {unit.entry}", place, place + 1, "")
+        path = draft / f"{unit.entry}.mp4"
+        try:
+            scenes = load_scenes(bench.plan.folder(unit) / f"seed_{rollouts.seed}")
+            video = scenes and write_video(path, path.with_suffix(".png"), rollouts, scenes)
+        except (NotApplicableError, StoreError) as why:
+            # Numbers do not depend on pictures: the page says why there is none.
+            left_out[unit.entry] = str(why)
+            continue
+        if video:
+            found += count_frames(path)
+            size = {"file": path.name, "kb": round(path.stat().st_size / 1e3)}
+            videos.append(video.summary() | size)
+            _to_mlflow(bench, unit, path)
+    written = sum(video["frames"] for video in videos)
+    return Outcome(
+        {"videos": videos, "left_out": left_out},
+        {"whole": (found == written, f"{found:,} of {written:,} frames in {len(videos)} videos")},
+    )
+
+
+def _best_driven(bench: Bench) -> Iterator[tuple[Unit, "Rollouts"]]:
+    """For each observation set the trained policy that does best in closed loop over all its seeds, and the first of them."""
+    from pipeline.simulate.trial import load_rollouts
+
+    trained = {v.name for v in bench.plan.variants if v.is_trained}
+    units = [
+        u for u in bench.plan.fresh_policy_units("rollouts") if bench.summary(u)["rollouts"] and u.policy in trained
+    ]
+    for observations in dict.fromkeys(u.entry for u in units):
+        said = {u: bench.summary(u)["rollouts"] for u in units if u.entry == observations}
+        best = max(said, key=lambda u: (said[u]["success"], said[u]["score"]))
+        yield best, load_rollouts(bench.plan.folder(best))[0]
+
+
+def _to_mlflow(bench: Bench, unit: Unit, path: Path) -> None:
+    from assets_defs.policies import mlflow_run, tracking
+    from pipeline.sinks.to_mlflow import log_file
+
+    variant = next(v for v in bench.plan.variants if v.name == unit.policy)
+    trained = Unit(f"{variant.name}/trained_policy", unit.entry)
+    log_file(tracking(bench), mlflow_run(bench, bench.task(variant, unit.entry), trained), path)
+
+
+def driven_videos(bench: Bench) -> list[tuple["Video", Path]]:
+    """The videos that were made, and where each is."""
+    from pipeline.sinks.rollout_video import Video
+
+    folder = bench.plan.folder(Unit("rollout_video"))
+    return [(Video.of(said), folder / said["file"]) for said in bench.summary(Unit("rollout_video"))["videos"]]
 
 
 def _rerun_recording(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:

@@ -29,18 +29,19 @@ CODE_VERSIONS = {
     "learning_curve": "1",
     "trained_policy": "1",
     "predictions": "3",
-    "rollouts": "3",
+    "rollouts": "4",
     "scored_predictions": "2",
     "benchmark_table": "7",
-    "benchmark_report": "8",
+    "benchmark_report": "9",
+    "rollout_video": "1",
     "mcap_log": "1",
-    "rerun_recording": "1",
+    "rerun_recording": "2",
 }
 """Raised by hand when what an asset computes changes: everything downstream becomes stale."""
 
 DATA = ("demonstrations", "episode_split", "windows", "multimodality_floor")
 MODES = ("action_modes",)
-SUMMARIES = ("benchmark_table", "benchmark_report", "mcap_log", "rerun_recording")
+SUMMARIES = ("benchmark_table", "rollout_video", "benchmark_report", "mcap_log", "rerun_recording")
 POLICY = ("trained_policy", "predictions", "rollouts")
 SCORED = "scored_predictions"
 """Predictions made elsewhere, an entry a name."""
@@ -229,11 +230,16 @@ class Plan:
                 policies = [u for kind in kinds for v in self.variants for u in self.policy_units(v, kind)]
                 policies += self.scored_units()
                 return [*(Unit(a) for a in ("episode_split", "multimodality_floor", "action_modes")), *policies]
+            case "rollout_video":
+                return [u for v in self.variants for u in self.policy_units(v, "rollouts")]
             case _:
                 policies = [u for v in self.variants for u in self.policy_units(v, "predictions")]
                 policies += self.scored_units()
-                shown = [Unit("benchmark_table"), *self.curves()] if unit.kind == "benchmark_report" else []
-                return [*shown, *policies]
+                shown = {
+                    "benchmark_report": [Unit("benchmark_table"), Unit("rollout_video"), *self.curves()],
+                    "rerun_recording": [Unit("rollout_video")],
+                }
+                return [*shown.get(unit.kind, []), *policies]
 
     def _asked_of_scored(self, unit: Unit) -> Mapping[str, Any]:
         """What the score of predictions made elsewhere depends on: as asked for now, else as when they were scored."""

@@ -42,8 +42,9 @@ def load_scenes(folder: Path) -> Scenes | None:
         _require_whole(scenes)
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise StoreError(
-            f"{path} is damaged ({str(error).splitlines()[0]}), so these roll-outs cannot be drawn; their numbers stand in a file of "
-            "their own. Delete the folder and run again: they are rolled out again, and nothing is trained."
+            f"{path} is damaged ({str(error).splitlines()[0]}), so these roll-outs cannot be drawn; their numbers stand in another "
+            f"file. Delete {folder.parent} and the data set's rollout_video, benchmark_report and rerun_recording, and run again: "
+            "policies are rolled out again, none is trained."
         ) from None
     return scenes
 

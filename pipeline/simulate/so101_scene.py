@@ -3,7 +3,7 @@
 What belongs here: where its things are. What does not: physics (`so101`), the model (`so101_world`), colours (`sinks`).
 """
 
-from itertools import product
+from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -78,7 +78,7 @@ def shapes(scenes: Scenes, row: int) -> list[Shape]:
 
 
 def _pairs(*places: int) -> list[list[int]]:
-    return [list(pair) for pair in zip(places[:-1], places[1:], strict=True)]
+    return [list(pair) for pair in pairwise(places)]
 
 
 def _flat(corners: list[tuple[float, float]] | np.ndarray) -> np.ndarray:

@@ -137,6 +137,10 @@ aside ul { margin: 6px 0; padding-left: 20px; font-size: 15px; overflow-wrap: an
 .wide .panels:has(.square) { grid-template-columns: repeat(auto-fill, minmax(min(100%, 330px), 1fr)); }
 figure { min-width: 0; margin: 0; break-inside: avoid; }
 figure:only-child { max-width: 720px; }
+.clips { display: grid; gap: 24px; max-width: 1024px; margin-top: 14px; }
+.clips figure:only-child { max-width: none; }
+.clips video { display: block; width: 100%; height: auto; border-radius: 8px; }
+.clips p { max-width: 100ch; margin: 6px 0 0; color: var(--muted); font-size: 14px; }
 figcaption { margin-bottom: 4px; font-size: 14px; font-weight: 600; overflow-wrap: anywhere; }
 .chart { width: 100%; min-height: 60px; }
 .chart svg { max-width: 100%; height: auto; overflow: visible; }

@@ -27,6 +27,7 @@ from pipeline.sinks.report_sections import (
     sensor_section,
 )
 from pipeline.sinks.report_table import benchmark_table, column_table
+from pipeline.sinks.report_video import Clip, video_section
 from pipeline.sinks.words import plural
 
 if TYPE_CHECKING:
@@ -53,29 +54,38 @@ class Provenance:
     warnings: tuple[str, ...] = ()
 
 
-def write_report(path: Path, table: Table, figures: Sequence["Figure"], provenance: Provenance) -> None:
+def write_report(
+    path: Path,
+    table: Table,
+    figures: Sequence["Figure"],
+    provenance: Provenance,
+    clips: Sequence[Clip] = (),
+    no_clips: Mapping[str, str] | None = None,
+) -> None:
     """Write the page of one data set.
 
     Parameters:
         table: one object of `run --json`.
         figures: from `figures.benchmark_figures`, in order.
+        clips: videos of roll-outs.
+        no_clips: observation set → why there is none of it, where there should be one.
 
     Raises:
         StoreError: the file cannot be written.
     """
-    page = render_report(table, figures, provenance)
+    page = render_report(table, figures, provenance, video_section(clips, no_clips or {}))
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
 
-def render_report(table: Table, figures: Sequence["Figure"], provenance: Provenance) -> str:
+def render_report(table: Table, figures: Sequence["Figure"], provenance: Provenance, videos: Html | None = None) -> str:
     """The whole page as text."""
     specs = [themed(panel.chart.to_dict()) for figure in figures for panel in figure.panels]
     bundle, draw = _vega_bundle(), draw_script()
     policies = [row["policy"] for row in table["policies"]]
     head = [
         element("meta", charset="utf-8"),
-        element("meta", http_equiv="Content-Security-Policy", content=_policy(bundle, draw)),
+        element("meta", http_equiv="Content-Security-Policy", content=_policy(bundle, draw, videos=videos is not None)),
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         element("meta", name="color-scheme", content="light dark"),
         element("link", rel="icon", href="data:,"),
@@ -87,7 +97,7 @@ def render_report(table: Table, figures: Sequence["Figure"], provenance: Provena
         element("script", bundle),
         element("script", draw),
     ]
-    body = element("body", element("main", _body(table, _sections(figures, specs), provenance)), scripts)
+    body = element("body", element("main", _body(table, _sections(figures, specs), provenance, videos)), scripts)
     return f"<!doctype html>\n{element('html', element('head', head), body, lang='en')}\n"
 
 
@@ -99,16 +109,20 @@ def _vega_bundle() -> Html:
     return script_text(vl_convert.javascript_bundle())
 
 
-def _policy(*scripts: str) -> str:
+def _policy(*scripts: str, videos: bool) -> str:
+    """What the page may load: the scripts it holds, pictures that it holds and, where it has any, videos that it holds."""
     hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     allowed = " ".join(f"'sha256-{digest}'" for digest in hashes)
     return (
         f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; img-src data:; "
+        f"{'media-src data:; ' if videos else ''}"
         "base-uri 'none'; form-action 'none'"
     )
 
 
-def _body(table: Table, sections: Mapping[str, list[Html]], provenance: Provenance) -> list[Html | None]:
+def _body(
+    table: Table, sections: Mapping[str, list[Html]], provenance: Provenance, videos: Html | None
+) -> list[Html | None]:
     return [
         element(
             "header", element("p", "demobench", class_="brand"), element("h1", table["dataset"]["name"]), _facts(table)
@@ -122,6 +136,7 @@ def _body(table: Table, sections: Mapping[str, list[Html]], provenance: Provenan
         modes_section(table),
         comparison_section(table),
         closed_loop_section(table),
+        videos,
         element("div", sections["policies"], class_="figures"),
         element(
             "section",

@@ -7,8 +7,8 @@ and PyAV: one thread, no dates, a font of Pillow's own.
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, fields
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -46,6 +46,7 @@ class Video:
 
     policy: str
     observations: str
+    seed: int
     simulator: str
     start_states: tuple[int, ...]
     succeeded: int
@@ -56,6 +57,12 @@ class Video:
     frames: int
     fps: float
 
+    @classmethod
+    def of(cls, said: Mapping[str, Any]) -> "Video":
+        """The inverse of `summary`; more entries do not matter."""
+        known = {field.name: said[field.name] for field in fields(cls)}
+        return cls(**known | {"start_states": tuple(said["start_states"])})
+
     def summary(self) -> dict[str, Any]:
         return asdict(self) | {"start_states": list(self.start_states)}
 
@@ -64,10 +71,10 @@ class Video:
         """In words, for those who see it and those who do not."""
         numbers = ", ".join(map(str, self.start_states))
         return (
-            f"{self.policy} ({self.observations}) drives by itself from start states {numbers}: {self.succeeded} of "
-            f"{len(self.start_states)} end {self.done}. {self.speed:g} times as fast as it was; the clock in each panel shows the "
-            "simulator's seconds. The orange line ahead is what the policy predicted when it was last asked, the grey one where it "
-            "went."
+            f"{self.policy} (seeing {self.observations}, training seed {self.seed}) drives by itself from start states {numbers} "
+            f"of {self.simulator}: {self.succeeded} of {len(self.start_states)} end {self.done}. Played {self.speed:g} times as "
+            "fast as it was; clocks show seconds of the simulator. The orange line is what the policy last said it would do, the "
+            "grey one what it did."
         )
 
 
@@ -89,9 +96,17 @@ def write_video(path: Path, poster: Path, rollouts: Rollouts, scenes: Scenes) ->
         last.quantize(64).save(draft, format="PNG", optimize=True)
     shown = len(scenes.chunks)
     return Video(
-        rollouts.policy, rollouts.observations, rollouts.simulator, tuple(rollouts.start_states[:shown].tolist()),
+        rollouts.policy, rollouts.observations, rollouts.seed, rollouts.simulator, tuple(rollouts.start_states[:shown].tolist()),
         int(rollouts.success[:shown].sum()), drawing.done, float(SPEED), *size, count, float(fps),
     )  # fmt: skip
+
+
+def count_frames(path: Path) -> int:
+    """The frames that a decoder finds."""
+    import av
+
+    with av.open(str(path)) as container:
+        return sum(1 for _ in container.decode(video=0))
 
 
 def _encode(path: Path, pictures: Iterator["Image"], fps: Fraction) -> tuple[tuple[int, int], int, "Image"]:
@@ -167,8 +182,8 @@ class _Panel:
 
     def __init__(self, painter: Painter, drawing: Drawing, rollouts: Rollouts, scenes: Scenes, row: int):
         self._painter, self._fps, self._done = painter, drawing.fps, drawing.done
-        self._shapes = drawing.shapes(scenes, row)
-        self._background = painter.background(self._shapes)
+        self._seen = painter.see(drawing.shapes(scenes, row))
+        self._background = painter.background(self._seen)
         self._number, self._success = int(rollouts.start_states[row]), bool(rollouts.success[row])
         self.last = int(rollouts.steps[row])
         self._end: Image | None = None
@@ -186,7 +201,7 @@ class _Panel:
         width, height = self._painter.size
         picture = Image.new("RGB", (width, height + HEAD))
         picture.paste(self._head(width, frame), (0, 0))
-        picture.paste(self._painter.frame(self._background, self._shapes, frame), (0, HEAD))
+        picture.paste(self._painter.frame(self._background, self._seen, frame), (0, HEAD))
         return picture
 
     def _head(self, width: int, frame: int) -> "Image":
@@ -205,7 +220,7 @@ class _Panel:
             left = right - font.getlength(word) - 1.6 * side
             brush.rounded_rectangle((left, 4 * FINER, right, high - 6 * FINER), 5 * FINER, fill=colour.light)
             brush.text(((left + right) / 2, middle), word, "#ffffff", font, anchor="mm")
-        return head.resize((width, HEAD), Image.Resampling.BOX)
+        return head.reduce(FINER)
 
 
 @cache
@@ -213,8 +228,3 @@ def _font() -> Any:
     from PIL import ImageFont
 
     return ImageFont.load_default(TEXT * FINER)
-
-
-def best_rolled_out(rollouts: Sequence[Rollouts]) -> Rollouts:
-    """What does best in closed loop: success, then the score."""
-    return max(rollouts, key=lambda one: (one.success.mean(), one.best_reward.mean()))

@@ -229,6 +229,12 @@ def log_rollouts(uri: str, run_id: str, summary: Mapping[str, Any]) -> None:
                     _send(client, children[str(one["seed"])], _series(own))
 
 
+def log_file(uri: str, run_id: str, path: Path) -> None:
+    """Add a file to a run."""
+    with _client(uri) as client:
+        client.log_artifact(run_id, str(path))
+
+
 def log_curve(uri: str, run_id: str, sizes: Sequence[Mapping[str, Any]]) -> None:
     """Add a learning curve: `curve_first_step_mae` and `curve_at_one_second_mae`, the step is the number of training episodes."""
     later = [size["at_one_second"] for size in sizes if size["at_one_second"]]
