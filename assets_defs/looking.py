@@ -12,6 +12,7 @@ from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec,
 from assets_defs.show import table
 
 if TYPE_CHECKING:
+    from pipeline.sinks.rerun_rollouts import Driven
     from pipeline.sinks.rollout_video import Video
     from pipeline.types import Rollouts
 
@@ -204,7 +205,7 @@ def _rerun_recording(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
     def rerun_recording(
         context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
     ) -> dg.MaterializeResult:
-        """Held-out episodes in Rerun: joints recorded against predicted, and the error over time."""
+        """Held-out episodes in Rerun: joints recorded against predicted, and the error over time; roll-outs beside them."""
         bench = workbench.open(context, budget)
         unit = Unit("rerun_recording")
         made = bench.make(unit, lambda draft: _write_rerun(bench, draft))
@@ -225,10 +226,25 @@ def _write_rerun(bench: Bench, draft) -> Outcome:
 
     path = draft / "held_out.rrd"
     episodes = _held_out(bench)
-    write_rerun(path, bench.demonstrations, bench.semantics, _predictions(bench), episodes, name=bench.plan.key)
+    shown, predictions = _driven(bench), _predictions(bench)
+    write_rerun(path, bench.demonstrations, bench.semantics, predictions, episodes, name=bench.plan.key, driven=shown)
     ids = _recorded_ids(bench, episodes)
     found = episodes_in(path)
     return Outcome(
         {"episodes": ids, "size_mb": round(path.stat().st_size / 1e6, 2)},
         {"holds_every_episode": (found == set(ids), f"{len(found)} of {len(ids)} episodes")},
     )
+
+
+def _driven(bench: Bench) -> list["Driven"]:
+    """The roll-outs that there are videos of."""
+    from pipeline.simulate.scene_files import load_scenes
+    from pipeline.simulate.trial import load_rollouts
+    from pipeline.sinks.rerun_rollouts import Driven
+
+    found = []
+    for video, path in driven_videos(bench):
+        folder = bench.plan.folder(Unit(f"{video.policy}/rollouts", video.observations))
+        rollouts = next(one for one in load_rollouts(folder) if one.seed == video.seed)
+        found.append(Driven(rollouts, load_scenes(folder / f"seed_{video.seed}"), video, path))
+    return found

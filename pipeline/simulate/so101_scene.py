@@ -100,4 +100,4 @@ def _cube(pose: np.ndarray) -> np.ndarray:
     return (pose[:, None, :3] + turned)[:, FACES]
 
 
-DRAWING = Drawing(Camera((0.82, -0.42, 0.52), (0.15, 0.0, 0.078), 28.5), 4 / 3, FPS, "placed", shapes)
+DRAWING = Drawing(Camera((0.82, -0.42, 0.52), (0.15, 0.0, 0.078), 29.5), 4 / 3, FPS, "placed", shapes)

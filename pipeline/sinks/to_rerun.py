@@ -3,6 +3,7 @@
     /episode_007/joints/<column>          [frames, series] the state, the recorded action, each policy's first action
     /episode_007/error                    [frames, policies] mean |first action − recorded action| over the columns
     /episode_007/path/…                   positions in a plane only: where it went, and the chunk predicted just now
+    /rollouts/…                           roll-outs (`rerun_rollouts`)
 
 What belongs here: entities, their looks, the blueprint, the viewer. What does not: choosing episodes, scores.
 
@@ -24,10 +25,11 @@ from pipeline.errors import StoreError
 from pipeline.normalize import wrap
 from pipeline.sinks import replacing
 from pipeline.sinks.palette import BASELINES, INK, MUTED, is_baseline, policy_colours
+from pipeline.sinks.rerun_rollouts import FRAME, TIME, Driven, rollouts_tab, send_rollouts
 from pipeline.sinks.words import common_unit
 from pipeline.types import ACTION, STATE, Demonstrations, Predictions, Semantics
 
-TIME, FRAME, EPISODE = "time", "frame", "episode_"
+EPISODE = "episode_"
 HIDDEN_AT_FIRST = ("constant_velocity", "mean_action")
 Rgb = tuple[int, int, int]
 
@@ -50,13 +52,15 @@ def write_rerun(
     episodes: Sequence[int],
     *,
     name: str,
+    driven: Sequence[Driven] = (),
 ) -> None:
-    """Write one `.rrd` file that opens with its own layout: a tab an episode.
+    """Write one `.rrd` file that opens with its own layout: a tab an episode, and one for the roll-outs of each policy shown.
 
     Parameters:
         predictions: of any policies; episodes that a policy was not asked about have no line of it.
         episodes: positions of the episodes to show, in this order.
         name: what the viewer calls the recording.
+        driven: roll-outs to show.
 
     Raises:
         StoreError: the file cannot be written.
@@ -67,7 +71,7 @@ def write_rerun(
     recording = rr.RecordingStream("demobench")
     with replacing(path) as temporary:
         temporary.touch()  # Rerun's own message about a folder that cannot be written names neither cause nor remedy
-        recording.save(temporary, default_blueprint=_blueprint(demos, semantics, episodes))
+        recording.save(temporary, default_blueprint=_blueprint(demos, semantics, episodes, driven))
         recording.send_recording_name(name)
         recording.send_property("demobench", rr.AnyValues(**_properties(demos, semantics)))
         for episode in episodes:
@@ -75,6 +79,8 @@ def write_rerun(
             _send_error(recording, demos, semantics, predictions, episode, lines[2:])
             if has_paths(demos, semantics):
                 _send_paths(recording, demos, semantics, predictions, episode, lines[2:])
+        for one in driven:
+            send_rollouts(recording, one)
         recording.flush()
         recording.disconnect()
 
@@ -245,13 +251,13 @@ def _column_names(demos: Demonstrations) -> list[str]:
     return [name if names.count(name) == 1 else f"{name}_{place}" for place, name in enumerate(names)]
 
 
-def _blueprint(demos: Demonstrations, semantics: Semantics, episodes: Sequence[int]) -> Any:
-    """A tab an episode: joints in a grid, the error below them, the path beside them where there is one."""
+def _blueprint(demos: Demonstrations, semantics: Semantics, episodes: Sequence[int], driven: Sequence[Driven]) -> Any:
+    """A tab an episode: joints in a grid, the error below them, the path beside them where there is one; then roll-outs."""
     import rerun.blueprint as rrb
 
-    tabs = [_tab(demos, semantics, episode) for episode in episodes]
+    tabs = [_tab(demos, semantics, episode) for episode in episodes] + [rollouts_tab(one) for one in driven]
     return rrb.Blueprint(
-        rrb.Tabs(*tabs, active_tab=0, name="held-out episodes"),
+        rrb.Tabs(*tabs, active_tab=0, name="held-out episodes and roll-outs" if driven else "held-out episodes"),
         rrb.TimePanel(state="collapsed", timeline=TIME),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),

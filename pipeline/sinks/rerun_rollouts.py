@@ -1,0 +1,145 @@
+"""Roll-outs in a Rerun recording: what there was to see, with the chunk predicted just now, and the video of it.
+
+    /rollouts/<policy>/<observations>/start_003/<thing>    in the plane or in space, as the simulator is drawn
+    /rollouts/<policy>/<observations>/video                the video of the report, on the same clock
+
+What belongs here: shapes as Rerun's entities, and their tab. What does not: where things are (`simulate.scene`), held-out episodes
+(`to_rerun`).
+
+The way of the effector is there from the start to the end, so that a chunk can be held against what then happened.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.simulate.scene import Camera, Drawing, Shape, drawing_of
+from pipeline.sinks.palette import ROLES
+from pipeline.sinks.rollout_video import Video
+from pipeline.types import Rollouts, Scenes
+
+TIME, FRAME = "time", "frame"
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Roll-outs to show, with what there was to see of them and their video."""
+
+    rollouts: Rollouts
+    scenes: Scenes
+    video: Video
+    mp4: Path
+
+    @property
+    def drawing(self) -> Drawing:
+        return drawing_of(self.rollouts.simulator)
+
+    def root(self, row: int | None = None) -> str:
+        """The entity of all, or of one start state, by its number."""
+        import rerun as rr
+
+        parts = ["rollouts", self.rollouts.policy, self.rollouts.observations]
+        return rr.new_entity_path(parts + ([] if row is None else [f"start_{self.rollouts.start_states[row]:03d}"]))
+
+
+def send_rollouts(recording: Any, driven: Driven) -> None:
+    """All start states of one policy, and its video."""
+    import rerun as rr
+
+    fps = driven.drawing.fps
+    for row in range(len(driven.scenes.chunks)):
+        root = driven.root(row)
+        if isinstance(driven.drawing.view, Camera):
+            recording.log(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for shape in driven.drawing.shapes(driven.scenes, row):
+            _send_shape(recording, f"{root}/{shape.name}", shape, fps)
+    _send_video(recording, f"{driven.root()}/video", driven)
+
+
+def rollouts_tab(driven: Driven) -> Any:
+    """A view for each start state, named after how it ended, and the video below them."""
+    import rerun.blueprint as rrb
+
+    views = [_view(driven, row) for row in range(len(driven.scenes.chunks))]
+    video = rrb.Spatial2DView(
+        origin=f"{driven.root()}/video", name=f"the same as a video ({driven.video.speed:g} times as fast there)"
+    )
+    title = f"roll-outs: {driven.rollouts.policy} ({driven.rollouts.observations})"
+    return rrb.Vertical(rrb.Grid(*views, grid_columns=4), video, row_shares=[3, 2], name=title)
+
+
+def _view(driven: Driven, row: int) -> Any:
+    import rerun.blueprint as rrb
+
+    rollouts, drawing = driven.rollouts, driven.drawing
+    word = drawing.done if rollouts.success[row] else "failed"
+    name = f"start state {rollouts.start_states[row]}: {word}, {rollouts.steps[row] / drawing.fps:.1f} s"
+    if not isinstance(drawing.view, Camera):
+        (left, top), (right, bottom) = drawing.view.low, drawing.view.high
+        bounds = rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom])
+        return rrb.Spatial2DView(origin=driven.root(row), name=name, visual_bounds=bounds)
+    eye = rrb.EyeControls3D(position=drawing.view.eye, look_target=drawing.view.looks_at, eye_up=[0, 0, 1])
+    return rrb.Spatial3DView(
+        origin=driven.root(row), name=name, eye_controls=eye, line_grid=rrb.LineGrid3D(visible=False)
+    )
+
+
+def _send_shape(recording: Any, entity: str, shape: Shape, fps: float) -> None:
+    """Looks once, places for every frame; polygons of the plane by their outline."""
+    import rerun as rr
+
+    count, dimensions = len(shape.points), shape.points.shape[-1]
+    still = count == 1
+    colour = [bytes.fromhex(ROLES[shape.role].dark[1:])[channel] for channel in range(3)]
+    times = [rr.TimeColumn(TIME, duration=np.arange(count) / fps), rr.TimeColumn(FRAME, sequence=np.arange(count))]
+    if not shape.width and dimensions == 3:
+        recording.log(entity, _mesh_looks(shape, colour), static=True)
+        places = shape.points.reshape(count, -1, 3)
+        columns = rr.Mesh3D.columns(vertex_positions=places.reshape(-1, 3)).partition([places.shape[1]] * count)
+        if still:
+            recording.log(entity, rr.Mesh3D.from_fields(vertex_positions=places[0]), static=True)
+        else:
+            recording.send_columns(entity, times, columns)
+        return
+    lines = rr.LineStrips2D if dimensions == 2 else rr.LineStrips3D
+    closed = shape.points if shape.width else np.concatenate([shape.points, shape.points[:, :, :1]], axis=2)
+    strips = [[line[np.isfinite(line[:, 0])] for line in frame] for frame in closed]
+    strips = [[line for line in frame if len(line) > 1] for frame in strips]
+    radius = shape.width / 2 if shape.width else -1.5
+    recording.log(entity, lines.from_fields(colors=[colour], radii=[radius]), static=True)
+    if still:
+        recording.log(entity, lines.from_fields(strips=strips[0]), static=True)
+        return
+    columns = lines.columns(strips=[line for frame in strips for line in frame])
+    recording.send_columns(entity, times, columns.partition([len(frame) for frame in strips]))
+
+
+def _mesh_looks(shape: Shape, colour: Sequence[int]) -> Any:
+    """Triangles of convex faces, a colour a face: light comes from above."""
+    import rerun as rr
+
+    _, faces, corners, _ = shape.points.shape
+    fan = np.array([[0, k, k + 1] for k in range(1, corners - 1)])
+    triangles = (fan + corners * np.arange(faces)[:, None, None]).reshape(-1, 3)
+    first = shape.points[0]
+    normals = np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    light = 0.7 + 0.3 * np.abs(normals[:, 2:]) - 0.12 * np.abs(normals[:, 1:2])
+    colours = np.repeat(np.round(light * np.array(colour)).astype(np.uint8), corners, axis=0)
+    return rr.Mesh3D.from_fields(triangle_indices=triangles, vertex_colors=colours)
+
+
+def _send_video(recording: Any, entity: str, driven: Driven) -> None:
+    """The video and, on the simulator's clock, which of its pictures is due; what is held at its end is left out."""
+    import rerun as rr
+
+    asset = rr.AssetVideo(path=driven.mp4)
+    recording.log(entity, asset, static=True)
+    nanos = asset.read_frame_timestamps_nanos()
+    seconds = np.asarray(nanos) * 1e-9 * driven.video.speed
+    drawn = seconds <= driven.rollouts.steps[: len(driven.scenes.chunks)].max() / driven.drawing.fps
+    times = [rr.TimeColumn(TIME, duration=seconds[drawn])]
+    recording.send_columns(entity, times, rr.VideoFrameReference.columns_nanos(np.asarray(nanos)[drawn]))
