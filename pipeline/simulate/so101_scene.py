@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 LINK_M, JAW_M, PLAN_M, WAY_M = 0.026, 0.011, 0.005, 0.002
 """How thick links and jaws are drawn, about as thick as they are; and the lines."""
+ABOVE_M = 0.001
+"""The target lies a hair above the table, or the two would flicker in a viewer that renders."""
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 FACES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 """The cube's corners, and its faces by them, anticlockwise from outside."""
@@ -68,7 +70,7 @@ def shapes(scenes: Scenes, row: int) -> list[Shape]:
     tips = points[:, -1]
     return [
         Shape("table", "ground", _flat([(-0.05, -0.23), (0.31, -0.23), (0.31, 0.23), (-0.05, 0.23)])),
-        Shape("target", "target", _disc(pose[0, 5:7], PLACED_M)),
+        Shape("target", "target", _disc(pose[0, 5:7], PLACED_M) + np.array([0.0, 0.0, ABOVE_M])),
         Shape("way", "way", tips[None, None], WAY_M),
         Shape("cube", "object", _cube(pose)),
         Shape("arm", "robot", points[:, _pairs(0, 1, 2, 3, 4, 5)], LINK_M),

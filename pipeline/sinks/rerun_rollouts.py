@@ -23,6 +23,9 @@ from pipeline.types import Rollouts, Scenes
 
 TIME, FRAME = "time", "frame"
 
+NEARER = 0.6
+"""A viewer sees a wider angle than the video does, so its eye stands nearer."""
+
 
 @dataclass(frozen=True)
 class Driven:
@@ -65,10 +68,10 @@ def rollouts_tab(driven: Driven) -> Any:
 
     views = [_view(driven, row) for row in range(len(driven.scenes.chunks))]
     video = rrb.Spatial2DView(
-        origin=f"{driven.root()}/video", name=f"the same as a video ({driven.video.speed:g} times as fast there)"
+        origin=f"{driven.root()}/video", name="the same as a video (H.264: the native viewer asks ffmpeg to decode it)"
     )
     title = f"roll-outs: {driven.rollouts.policy} ({driven.rollouts.observations})"
-    return rrb.Vertical(rrb.Grid(*views, grid_columns=4), video, row_shares=[3, 2], name=title)
+    return rrb.Vertical(rrb.Grid(*views, grid_columns=4), video, row_shares=[2, 1], name=title)
 
 
 def _view(driven: Driven, row: int) -> Any:
@@ -81,7 +84,9 @@ def _view(driven: Driven, row: int) -> Any:
         (left, top), (right, bottom) = drawing.view.low, drawing.view.high
         bounds = rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom])
         return rrb.Spatial2DView(origin=driven.root(row), name=name, visual_bounds=bounds)
-    eye = rrb.EyeControls3D(position=drawing.view.eye, look_target=drawing.view.looks_at, eye_up=[0, 0, 1])
+    target, eye = np.array(drawing.view.looks_at), np.array(drawing.view.eye)
+    nearer = target + NEARER * (eye - target)
+    eye = rrb.EyeControls3D(position=nearer, look_target=target, eye_up=[0, 0, 1])
     return rrb.Spatial3DView(
         origin=driven.root(row), name=name, eye_controls=eye, line_grid=rrb.LineGrid3D(visible=False)
     )
@@ -140,6 +145,7 @@ def _send_video(recording: Any, entity: str, driven: Driven) -> None:
     recording.log(entity, asset, static=True)
     nanos = asset.read_frame_timestamps_nanos()
     seconds = np.asarray(nanos) * 1e-9 * driven.video.speed
-    drawn = seconds <= driven.rollouts.steps[: len(driven.scenes.chunks)].max() / driven.drawing.fps
+    end_s = driven.rollouts.steps[: len(driven.scenes.chunks)].max() / driven.drawing.fps
+    drawn = seconds < end_s + 0.5 * driven.video.speed / driven.video.fps
     times = [rr.TimeColumn(TIME, duration=seconds[drawn])]
     recording.send_columns(entity, times, rr.VideoFrameReference.columns_nanos(np.asarray(nanos)[drawn]))

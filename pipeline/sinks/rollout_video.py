@@ -35,7 +35,7 @@ HOLD_S = 1.5
 """How long the end is shown."""
 PAGE = "#e4e7eb"
 ENCODER = "libx264"
-OPTIONS = {"preset": "veryfast", "crf": "27", "tune": "animation"}
+OPTIONS = {"preset": "veryfast", "crf": "29", "tune": "animation"}
 WHOLE_PX = (64, 16)
 """Width and height are multiples of these: the encoder also looks at what pads a row in memory, which is anything."""
 

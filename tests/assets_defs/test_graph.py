@@ -70,7 +70,7 @@ def test_a_longer_training_makes_policies_stale_and_nothing_before_them(copy):
     stale = copy.plan().stale()
     assert {u.asset for u in stale} == {
         *(f"mlp_k0{k}/{kind}" for k in (1, 4) for kind in ("trained_policy", "predictions", "rollouts")),
-        "benchmark_table", "benchmark_report", "mcap_log", "rerun_recording",
+        "benchmark_table", "rollout_video", "benchmark_report", "mcap_log", "rerun_recording",
     }  # fmt: skip
 
 

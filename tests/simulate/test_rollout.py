@@ -89,6 +89,26 @@ def test_paths_hold_every_place_and_nothing_after_the_end():
     assert rollout(Creeper(), Line(draws=False), SET, [0], name="creeper", history=1).paths is None
 
 
+def test_scenes_hold_what_was_seen_and_said_of_the_first_start_states():
+    results = rollout(Creeper(), Line(), SET, [0, 50, 99, 7], name="creeper", history=1, scenes=3, batch=2)
+    scenes = results.scenes
+    assert scenes.shown[STATE].shape == (3, 11, 1)
+    np.testing.assert_allclose(scenes.shown[STATE][0, :, 0], np.arange(11) / 10, atol=1e-6)
+    np.testing.assert_allclose(scenes.shown[STATE][1, :6, 0], np.arange(5, 11) / 10, atol=1e-6)
+    assert np.isfinite(scenes.shown[STATE]).sum(axis=(1, 2)).tolist() == (results.steps[:3] + 1).tolist()
+    assert scenes.asked.tolist() == [0, 8]
+    np.testing.assert_allclose(scenes.chunks[0, 1, :, 0], 0.8 + 0.1 * np.arange(1, 17), atol=1e-6)
+    assert np.isnan(scenes.chunks[1:, 1]).all(), "over before it was asked again"
+    assert rollout(Creeper(), Line(), SET, [0], name="creeper", history=1).scenes is None
+
+
+def test_scenes_keep_few_answers_of_a_policy_that_is_asked_at_every_frame():
+    results = rollout(
+        Creeper(step=0.001), Line(), SET, [0], name="creeper", history=1, execution=Execution(1), scenes=1
+    )
+    assert results.scenes.asked.tolist() == [0, 4, 8, 12, 16]
+
+
 def test_history_begins_with_the_first_frame_repeated():
     policy = Creeper(step=0.01)
     rollout(policy, Line(), SET, [7], name="creeper", history=3, execution=Execution(1), max_steps=4)

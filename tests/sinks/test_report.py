@@ -15,8 +15,11 @@ from pipeline.errors import StoreError
 from pipeline.sinks.figures import benchmark_figures
 from pipeline.sinks.markup import outside_references
 from pipeline.sinks.report import Provenance, render_report, write_report
+from pipeline.sinks.report_video import Clip
+from pipeline.sinks.rollout_video import write_video
 from pipeline.types import ACTION
 
+from .driving import make_driven
 from .making import (
     NASTY,
     make_bracket,
@@ -204,6 +207,49 @@ def test_the_file_asks_for_nothing_and_is_small(tmp_path, table, figures):
     assert list(tmp_path.iterdir()) == [tmp_path / "report.html"]
 
 
+def content_policy(page: str) -> str:
+    return html.unescape(re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)[1])
+
+
+@pytest.fixture
+def clip(tmp_path) -> Clip:
+    rollouts = make_driven((5, 3))
+    mp4, poster = tmp_path / "state.mp4", tmp_path / "state.png"
+    return Clip(write_video(mp4, poster, rollouts, rollouts.scenes), mp4, poster)
+
+
+def test_videos_are_in_the_page_and_the_policy_lets_them_and_nothing_else_in(tmp_path, table, figures, clip):
+    path = tmp_path / "report.html"
+    write_report(path, table, figures, PROVENANCE, [clip])
+    page = path.read_text()
+    [video] = re.findall(r"<video [^>]*>", page)
+    inside = re.search(r'src="data:video/mp4;base64,([^"]*)"', video)[1]
+    assert base64.b64decode(inside) == clip.mp4.read_bytes()
+    assert " controls muted playsinline loop " in video
+    assert 'poster="data:image/png;base64,' in video
+    assert clip.video.caption in text_of(page)
+    rules = [rule.split() for rule in content_policy(page).split(";")]
+    assert ["media-src", "data:"] in rules
+    assert {rule[0] for rule in rules} == {
+        "default-src", "script-src", "style-src", "img-src", "media-src", "base-uri", "form-action",
+    }  # fmt: skip
+    assert outside_references(path) == []
+
+
+def test_a_page_without_videos_has_no_section_and_lets_none_in(table, figures):
+    page = render_report(table, figures, PROVENANCE)
+    assert "<video" not in page
+    assert "drives by itself?" not in text_of(page).replace("when it drives by itself?", "")
+    assert "media-src" not in content_policy(page)
+
+
+def test_why_a_video_is_missing_is_said_and_escaped(tmp_path, table, figures):
+    write_report(tmp_path / "a.html", table, figures, PROVENANCE, [], {"pose": f"damaged {NASTY}"})
+    page = (tmp_path / "a.html").read_text()
+    assert f"No video of pose: damaged {NASTY}" in text_of(page)
+    assert NASTY not in page.partition("<body>")[2]
+
+
 def test_a_place_that_cannot_be_written_is_one_clear_message(tmp_path, table):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(StoreError, match=r"report\.html cannot be written: .*choose another folder"):
@@ -291,3 +337,18 @@ def test_the_units_of_the_data_reach_the_page(tmp_path, demos, semantics, table,
     assert demos.features[ACTION].units == ("px", "px")
     page = render_report(table, benchmark_figures(table, demos, semantics, predictions), PROVENANCE)
     assert "mean error (px)" in page
+
+
+def test_a_browser_plays_the_video_that_the_page_holds(browser, tmp_path, table, figures, clip):
+    path = tmp_path / "report.html"
+    write_report(path, table, figures, PROVENANCE, [clip])
+    page, asked, said = visit(browser, path)
+    video = page.locator("video")
+    video.scroll_into_view_if_needed()
+    page.wait_for_timeout(1500)
+    size = [video.evaluate(f"one => one.{name}") for name in ("videoWidth", "videoHeight", "duration")]
+    assert size[:2] == [clip.video.width, clip.video.height]
+    assert size[2] == pytest.approx(clip.video.frames / clip.video.fps, abs=0.02)
+    assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
+    assert said == []
+    page.close()

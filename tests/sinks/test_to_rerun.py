@@ -11,10 +11,14 @@ import pytest
 from rerun.chunk import RrdReader
 
 from pipeline.errors import StoreError
+from pipeline.simulate.so101 import POSE
 from pipeline.sinks import to_rerun
+from pipeline.sinks.rerun_rollouts import Driven
+from pipeline.sinks.rollout_video import write_video
 from pipeline.sinks.to_rerun import episodes_in, has_paths, view, write_rerun
-from pipeline.types import ACTION, STATE
+from pipeline.types import ACTION, STATE, Scenes
 
+from .driving import make_driven
 from .making import NASTY, make_demos, make_predictions, make_semantics
 
 
@@ -138,6 +142,60 @@ def test_no_predictions_at_all(tmp_path, demos, semantics):
     write_rerun(tmp_path / "a.rrd", demos, semantics, [], [0], name="a")
     assert "/episode_007/error" not in read(tmp_path / "a.rrd")
     assert episodes_in(tmp_path / "a.rrd") == {7}
+
+
+@pytest.fixture
+def driven(tmp_path) -> Driven:
+    rollouts, mp4 = make_driven(), tmp_path / "state.mp4"
+    return Driven(rollouts, rollouts.scenes, write_video(mp4, tmp_path / "state.png", rollouts, rollouts.scenes), mp4)
+
+
+def test_roll_outs_stand_under_the_numbers_of_their_start_states(tmp_path, demos, semantics, driven):
+    path = tmp_path / "a.rrd"
+    write_rerun(path, demos, semantics, [], [0], name="a", driven=[driven])
+    entities = read(path)
+    root = "/rollouts/mlp_k04/state"
+    for number in (7, 8, 9):
+        assert {
+            f"{root}/start_{number:03d}/{thing}" for thing in ("goal", "block", "finger", "way", "predicted_chunk")
+        } <= set(entities)
+    block = entities[f"{root}/start_008/block"]
+    assert len(column([chunk for chunk in block if not chunk.is_static], "LineStrips2D:strips")) == 6 + 1
+    plan = column([c for c in entities[f"{root}/start_008/predicted_chunk"] if not c.is_static], "LineStrips2D:strips")
+    np.testing.assert_allclose(plan[1][0], [[72, 400], [84, 400], [96, 400], [108, 400]])
+    assert plan[-1] == [], "nothing lies ahead at the end"
+    seconds = [t.total_seconds() for t in column([c for c in block if not c.is_static], "time")]
+    np.testing.assert_allclose(seconds, np.arange(7) / 10, atol=1e-6)
+    assert episodes_in(path) == {7}, "roll-outs are no held-out episodes"
+
+
+def test_the_video_runs_on_the_clock_of_the_simulator(tmp_path, demos, semantics, driven):
+    write_rerun(tmp_path / "a.rrd", demos, semantics, [], [0], name="a", driven=[driven])
+    video = read(tmp_path / "a.rrd")["/rollouts/mlp_k04/state/video"]
+    [blob] = column([chunk for chunk in video if chunk.is_static], "AssetVideo:blob")
+    assert bytes(blob[0]) == driven.mp4.read_bytes()
+    due = [chunk for chunk in video if not chunk.is_static]
+    seconds = [t.total_seconds() for t in column(due, "time")]
+    np.testing.assert_allclose(seconds, np.arange(13) / 10, atol=1e-3)
+    shown = [nanos[0] * 1e-9 for nanos in column(due, "VideoFrameReference:timestamp")]
+    np.testing.assert_allclose(shown, np.array(seconds) / driven.video.speed, atol=1e-3)
+
+
+def test_rerun_finds_no_fault_in_an_arm_either(tmp_path, demos, semantics):
+    pytest.importorskip("mujoco")
+    state = np.zeros((1, 5, 6), np.float32)
+    state[0, :, 0] = np.arange(5)
+    pose = np.tile(np.array([0.2, 0, 0.015, 1, 0, 0.2, 0.1], np.float32), (1, 5, 1))
+    scenes = Scenes({STATE: state, POSE: pose}, np.array([0]), np.zeros((1, 1, 8, 6), np.float32))
+    rollouts = replace(make_driven((4,), "so101"), scenes=scenes)
+    mp4, path = tmp_path / "a.mp4", tmp_path / "a.rrd"
+    one = Driven(rollouts, scenes, write_video(mp4, tmp_path / "a.png", rollouts, scenes), mp4)
+    write_rerun(path, demos, semantics, [], [0], name="a", driven=[one])
+    test_rerun_itself_finds_no_fault(path)
+    cube = [chunk for chunk in read(path)["/rollouts/mlp_k04/state/start_007/cube"] if not chunk.is_static]
+    corners = np.array(column(cube, "Mesh3D:vertex_positions"))
+    assert corners.shape == (5, 24, 3)
+    np.testing.assert_allclose(corners.mean(axis=(0, 1)), [0.2, 0, 0.015], atol=1e-6)
 
 
 def test_two_observation_sets_are_told_apart(tmp_path, demos, semantics):
