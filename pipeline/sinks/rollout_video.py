@@ -69,7 +69,9 @@ class Video:
     @property
     def caption(self) -> str:
         """In words, for those who see it and those who do not."""
-        numbers = ", ".join(map(str, self.start_states))
+        first, last = self.start_states[0], self.start_states[-1]
+        in_order = len(self.start_states) > 2 and self.start_states == tuple(range(first, last + 1))
+        numbers = f"{first} to {last}" if in_order else ", ".join(map(str, self.start_states))
         return (
             f"{self.policy} (seeing {self.observations}, training seed {self.seed}) drives by itself from start states {numbers} "
             f"of {self.simulator}: {self.succeeded} of {len(self.start_states)} end {self.done}. Played {self.speed:g} times as "
