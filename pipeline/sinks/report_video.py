@@ -26,7 +26,7 @@ def video_section(clips: Sequence[Clip], left_out: Mapping[str, str]) -> Html | 
     if not clips and not left_out:
         return None
     why = [element("p", f"No video of {name}: {reason}") for name, reason in left_out.items()]
-    said = "For each observation set the policy that does best in closed loop, from the first start states: none of them was picked."
+    said = "For each observation set the policy that does best in closed loop, from the first start states: none was picked."
     return element(
         "section",
         element("h2", "What does it look like when the best policy drives by itself?"),
