@@ -50,8 +50,8 @@ def summarise_rollouts(rollouts: Sequence[Rollouts]) -> dict[str, Any]:
 
     `score` is the mean over start states of the episode's best reward (PushT: min(1, coverage / 0.95)); it is not a
     coverage. `best_coverage` is there where the task has one, `stages` and `stage_counts` where it has stages,
-    `interventions` (frames in which the safety layer stepped in) where there was a safety layer. Each of the three has an
-    `_interval` and, beside it, an `_interval_method`.
+    `interventions` (frames in which the safety layer stepped in) where there was a safety layer. `success`, `score` and
+    `best_coverage` each have an `_interval` and an `_interval_method` beside them.
     """
     first, success = rollouts[0], values_of(rollouts, "success")
     seeds, n = success.shape
