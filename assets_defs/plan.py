@@ -123,8 +123,16 @@ class Plan:
         return self._memo[unit]
 
     def is_fresh(self, unit: Unit) -> bool:
+        """Whether a result is there and up to date. A policy's result whose own check failed never is: the check stopped what
+        follows from it once, and stops it the next time, too."""
         fingerprint = self.fingerprint(unit)
-        return fingerprint is not None and self.store.is_fresh(self.folder(unit), fingerprint)
+        if fingerprint is None or not self.store.is_fresh(self.folder(unit), fingerprint):
+            return False
+        return unit.kind not in POLICY or not self._failed_checks(unit)
+
+    def _failed_checks(self, unit: Unit) -> list[str]:
+        made = self.store.made(self.folder(unit))
+        return [name for name, (passed, _) in made.summary.get("checks", {}).items() if not passed] if made else []
 
     def forget(self) -> None:
         """After results were made: look at the store again."""
@@ -146,7 +154,8 @@ class Plan:
             elif self.store.made(self.folder(unit)) is None:
                 why[unit] = "never made"
             elif not self.is_fresh(unit):
-                why[unit] = "its data, settings or code changed"
+                failed = self._failed_checks(unit) if unit.kind in POLICY else []
+                why[unit] = f"its check '{failed[0]}' failed" if failed else "its data, settings or code changed"
         return why
 
     def fresh_policy_units(self, kind: str) -> list[Unit]:

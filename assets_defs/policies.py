@@ -207,7 +207,7 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
     trained_unit = Unit(f"{variant.name}/trained_policy", unit.entry)
     bench.progress(f"{variant.name} {unit.entry} predictions", 0, 1, "")
     predicted, facts = predict_folds(task, bench.plan.folder(trained_unit))
-    finite = bool(np.isfinite(predicted.actions).all())
+    broken = int((~np.isfinite(predicted.actions)).sum())
     score = score_task(task, predicted)
     samples = sampled_scores(task, bench.plan.folder(trained_unit))
     save_predictions(predicted, draft)
@@ -225,7 +225,7 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
     return Outcome(
         {"metrics": score.metrics, "samples": samples, "split_hash": task.split.hash, **facts},
         {
-            "finite": (finite, f"{predicted.actions.size:,} numbers"),
+            "finite": (not broken, f"{broken:,} of {predicted.actions.size:,} numbers are not finite"),
             "every_held_out_episode": (scored == held_out, f"{len(scored)} of {len(held_out)} episodes"),
         },
     )

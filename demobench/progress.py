@@ -1,7 +1,7 @@
 """Showing a run while it works: bars on a terminal, plain lines elsewhere, and the one message when it fails."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -47,8 +47,8 @@ class RunProgress:
         self._stream = os.fdopen(os.dup(2), "w")
         self._console = Console(file=self._stream, highlight=False, no_color=console.no_color)
         self._live = self._console.is_terminal
-        self._failure: DemobenchError | None = None
-        self._failed_checks: list[str] = []
+        self._failures: dict[str, DemobenchError | None] = {}
+        self._failed_checks: dict[str, str] = {}
         self._done = 0
         self._bars = Progress(
             SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), _Rate(),
@@ -90,26 +90,53 @@ class RunProgress:
             if not self._live:
                 seconds = event.event_specific_data.duration_ms / 1000
                 self.say(f"[{self._done:>2}/{len(self._assets)}] {self._asset_of(event)} {seconds:.1f} s")
-        elif kind == "ASSET_CHECK_EVALUATION" and not event.event_specific_data.passed:
-            check = event.event_specific_data
+        elif kind == "ASSET_CHECK_EVALUATION" and _stops(event.event_specific_data):
+            check, asset = event.event_specific_data, event.event_specific_data.asset_key.to_user_string()
             why = check.metadata["why"].value if "why" in check.metadata else ""
-            self._failed_checks.append(f"{check.asset_key.to_user_string()}: check '{check.check_name}' failed: {why}")
-        elif kind in ("STEP_FAILURE", "RUN_FAILURE", "PIPELINE_FAILURE") and self._failure is None:
-            self._failure = _failure_of(getattr(event.event_specific_data, "error", None))
+            kept = "Nothing that depends on it was made; results before it are kept."
+            self._failed_checks.setdefault(asset, f"{asset}: check '{check.check_name}' failed: {why}. {kept}")
+        elif kind == "STEP_FAILURE" or (kind in ("RUN_FAILURE", "PIPELINE_FAILURE") and not self._failures):
+            self._failures[self._asset_of(event)] = _failure_of(getattr(event.event_specific_data, "error", None))
 
     @staticmethod
     def _asset_of(event: Any) -> str:
         return (event.step_key or "").replace("__", "/")
 
     def raise_failure(self, run_id: str) -> None:
-        """The run failed: raise what the user can do something about."""
-        if self._failed_checks:
-            raise DemobenchError(
-                f"{self._failed_checks[0]}. Nothing that depends on it was made; results before it are kept."
-            )
-        if self._failure is not None:
-            raise self._failure
+        """The run failed: raise what the user can do something about.
+
+        Raises:
+            PoliciesFailed: nothing but policies failed.
+        """
+        # Dagster says of a failed check that its step failed, too.
+        failures = {a: why for a, why in self._failures.items() if why is not None and a not in self._failed_checks}
+        assets = [*failures, *self._failed_checks]
+        unexpected = any(isinstance(why, UnexpectedError) for why in failures.values())
+        if assets and not unexpected and all("/" in asset for asset in assets):
+            words = {asset: str(why) for asset, why in failures.items()} | self._failed_checks
+            policies = {asset: asset.split("/")[0] for asset in words}
+            raise PoliciesFailed({policies[a]: said.removeprefix(f"{policies[a]}/") for a, said in words.items()})
+        for words in self._failed_checks.values():
+            raise DemobenchError(words)
+        for why in failures.values():
+            raise why
         raise DemobenchError(f"The run {run_id[:8]} failed for a reason that is in its log: demobench ui, Runs.")
+
+
+def _stops(check: Any) -> bool:
+    """Whether a check failed that nothing goes on after."""
+    return check.blocking and not check.passed
+
+
+class PoliciesFailed(DemobenchError):
+    """Policies could not be trained or asked; everything else could be made. `why` is policy → what was wrong."""
+
+    def __init__(self, why: Mapping[str, str]):
+        names: dict[str, list[str]] = {}
+        for policy, words in why.items():
+            names.setdefault(words, []).append(policy)
+        super().__init__("\n".join(f"{', '.join(policies)}: {words}" for words, policies in names.items()))
+        self.why = dict(why)
 
 
 class UnexpectedError(DemobenchError):

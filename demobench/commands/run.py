@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,8 @@ from pipeline.methods import METHODS, is_own
 if TYPE_CHECKING:
     from dagster import DagsterInstance, Definitions
 
-    from demobench.progress import RunProgress
+    from assets_defs.plan import Plan
+    from demobench.progress import PoliciesFailed, RunProgress
 
 
 def run_benchmarks(
@@ -44,8 +46,10 @@ def run_benchmarks(
     targets = [resolve_target(n, session.config, session.config_dir, chosen, registered) for n in names]
     check_source(targets, session)
     session.store.ensure()
-    results = [_run_one(target, session) for target in targets]
-    write_json_to(json_to, results)
+    results, failures = zip(*(_run_one(target, session) for target in targets), strict=True)
+    write_json_to(json_to, list(results))
+    for failure in filter(None, failures):
+        raise failure
 
 
 def check_source(targets: Sequence[Target], session: Session) -> None:
@@ -58,22 +62,13 @@ def check_source(targets: Sequence[Target], session: Session) -> None:
             METHODS[method].load_class().check()
 
 
-def _run_one(target: Target, session: Session) -> dict[str, Any]:
-    from assets_defs.plan import Plan
-
+def _run_one(target: Target, session: Session) -> tuple[dict[str, Any], "PoliciesFailed | None"]:
+    """The table, and what kept policies from it."""
     console, store = session.console, session.store
-    plan = Plan(
-        store,
-        target.key,
-        target.experiment,
-        tuple(target.experiment.variants),
-        tuple(v.name for v in target.selected),
-        target.observations,
-    )
     with store.lock(target.key):
         store.register(target.key, target.experiment.model_dump(mode="json"))
-        materialise(target, session, list(plan.stale()))
-    plan.forget()
+        failure = _make(target, session)
+    plan = _plan(target, session)
     report = collect(target, plan, session)
     show(report, target, session)
     for unit in plan.scored_units():
@@ -83,7 +78,30 @@ def _run_one(target: Target, session: Session) -> dict[str, Any]:
                 "again with: demobench score[/]",
                 soft_wrap=True,
             )
-    return report
+    return report, failure
+
+
+def _plan(target: Target, session: Session) -> "Plan":
+    from assets_defs.plan import Plan
+
+    variants, selected = tuple(target.experiment.variants), tuple(v.name for v in target.selected)
+    return Plan(session.store, target.key, target.experiment, variants, selected, target.observations)
+
+
+def _make(target: Target, session: Session) -> "PoliciesFailed | None":
+    """Make what is stale. A policy that cannot be trained or asked must not keep the others from the table."""
+    from demobench.progress import PoliciesFailed
+
+    try:
+        materialise(target, session, list(_plan(target, session).stale()))
+    except PoliciesFailed as failure:
+        others = tuple(v for v in target.selected if v.name not in failure.why)
+        if not others:
+            raise
+        rest = replace(target, selected=others)
+        materialise(rest, session, list(_plan(rest, session).stale()))
+        return failure
+    return None
 
 
 def materialise(

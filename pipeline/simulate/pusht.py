@@ -8,6 +8,7 @@ Start state n is `PushTEnv.reset(seed=n)`. The demonstrations that ship with the
 above (`pusht_demonstrator`), so that no roll-out begins where a demonstration began.
 """
 
+import math
 import warnings
 from collections.abc import Sequence
 from importlib import metadata
@@ -29,6 +30,8 @@ COLUMNS = {STATE: ("x_px", "y_px"), BLOCK: ("block_x_px", "block_y_px", "block_a
 TABLE_PX = 512.0
 FPS = 10
 MAX_STEPS = 300
+FARTHEST_PX = 1e4
+"""Whatever is farther away has left the physics: walls stand around the table."""
 SUCCESS_COVERAGE = 0.95
 """An episode succeeds above this coverage, and reward is 1 from here on: min(1, coverage / 0.95)."""
 
@@ -126,6 +129,7 @@ class PushTEnvironments:
     """R PushT environments that step together (see `pipeline.simulate.Environments`)."""
 
     def __init__(self, numbers: Sequence[int]):
+        self._numbers, self._frame = list(numbers), 0
         self._environments = [make_environment(number) for number in numbers]
         self._coverage = Coverage(self._environments[0])
 
@@ -133,9 +137,21 @@ class PushTEnvironments:
         return pose_columns(self._environments)
 
     def step(self, actions: np.ndarray, running: np.ndarray) -> Outcome:
+        """See `pipeline.simulate.Environments`.
+
+        Raises:
+            NotApplicableError: the physics blew up.
+        """
         moving = np.flatnonzero(running)
+        self._frame += 1
         for i in moving:
             advance(self._environments[i], float(actions[i, 0]), float(actions[i, 1]))
+            if not _is_physics(self._environments[i]):
+                raise NotApplicableError(
+                    f"The physics of PushT blew up at frame {self._frame} of start state {self._numbers[i]}: the finger or the "
+                    "block is where nothing can be. Install the versions of gym-pusht and pymunk that constraints.txt names, or "
+                    "leave roll-outs of this data set out."
+                )
         coverage = np.zeros(len(self._environments))
         if len(moving):
             coverage[moving] = self._coverage([self._environments[i] for i in moving])
@@ -146,6 +162,12 @@ class PushTEnvironments:
 
     def effector(self) -> np.ndarray:
         return np.array([environment.agent.position for environment in self._environments])
+
+
+def _is_physics(environment: "PushTEnv") -> bool:
+    """Whether everything is somewhere; the walls keep it near the table."""
+    agent, block = environment.agent, environment.block
+    return all(abs(place) < FARTHEST_PX for place in (*agent.position, *block.position)) and math.isfinite(block.angle)
 
 
 def reward_of(coverage: np.ndarray) -> np.ndarray:
