@@ -71,7 +71,7 @@ def run(
     ] = None,
     folds: Annotated[int | None, typer.Option(min=1, help="Folds of the split by episode.")] = None,
     protocol: Annotated[
-        Protocol | None, typer.Option(help="strict, or notebook to reproduce published numbers.")
+        Protocol | None, typer.Option(help="strict, or notebook: as in the notebook that this project grew from.")
     ] = None,
     rollouts: Annotated[int | None, typer.Option(min=1, help="Start states in closed loop.")] = None,
     rollout_seeds: Annotated[int | None, typer.Option(min=1, help="Training seeds in closed loop.")] = None,
@@ -131,7 +131,10 @@ def floor(
     config: ConfigOption = None,
     json_to: JsonOption = None,
 ) -> None:
-    """How small can the error of a deterministic policy get here? People do different things in the same place."""
+    """How small can the error of a deterministic policy get here? People do different things in the same place.
+
+    --radius, --probes and --min-neighbours are of the notebook's estimator: that of the study that this project grew from.
+    """
     from demobench.commands.floor import measure_floor
 
     measure_floor(
@@ -210,7 +213,7 @@ def curve(
         BudgetName | None, typer.Option(help="quick (600 steps), standard (3,000) or thorough (20,000).")
     ] = None,
     folds: Annotated[int | None, typer.Option(min=1, help="Folds of the split by episode.")] = None,
-    protocol: Annotated[Protocol | None, typer.Option(help="strict, or notebook.")] = None,
+    protocol: Annotated[Protocol | None, typer.Option(help="strict, or notebook (see run --help).")] = None,
     device: Annotated[Literal["auto", "cpu", "cuda"] | None, typer.Option(help="auto, cpu or cuda.")] = None,
     config: ConfigOption = None,
     store: StoreOption = None,

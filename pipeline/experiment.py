@@ -348,12 +348,19 @@ def _base(argument: str, config: Config, config_dir: Path, registered: Mapping[s
 
 
 def _free_key(source: str, config: Config, registered: Mapping[str, Any]) -> str:
+    """The key that a source has in the store; for one that is new there its name, with a hash where that is another's."""
     last = re.split(r"[/:]", source.split("@")[0].rstrip("/"))[-1]
     name = re.sub(r"\.{2,}", ".", re.sub(r"[^A-Za-z0-9_.-]", "-", last))[:60].strip("._-") or "dataset"
-    taken_by = registered.get(name, {}).get("dataset", {}).get("source")
-    if name in config.datasets or (taken_by is not None and taken_by != source):
-        name = f"{name}-{hash_of(source)[:8]}"
-    return check_slug(name, f"data set {source}")
+    hashed = f"{name}-{hash_of(source)[:8]}"
+
+    def owners(base: str) -> set[str]:
+        """Of a name, with whatever settings."""
+        known = (known for key, known in registered.items() if key.split("+")[0] == base)
+        return {one.get("dataset", {}).get("source") for one in known}
+
+    is_there = source in owners(hashed) and source not in owners(name)
+    taken = name in config.datasets or owners(name) - {source}
+    return check_slug(hashed if is_there or taken else name, f"data set {source}")
 
 
 def with_choices(base: Experiment, choices: Choices) -> Experiment:

@@ -85,6 +85,9 @@ def test_a_folder_gets_its_name_and_a_hash_when_that_is_taken(tmp_path):
     assert again.key == first.key
     other = target(str(folder), registered={first.key: {"dataset": {"source": "/elsewhere"}}})
     assert other.key.startswith("my-data-")
+    # It keeps that name when the other is gone, and a name belongs to somebody though only with other settings.
+    assert target(str(folder), registered={other.key: other.experiment.model_dump(mode="json")}).key == other.key
+    assert target(str(folder), registered={f"{first.key}+1a2b": {"dataset": {"source": "/elsewhere"}}}).key == other.key
     named_like_the_file = tmp_path / "tape"
     named_like_the_file.mkdir()
     assert target(str(named_like_the_file)).key.startswith("tape-")

@@ -171,6 +171,14 @@ def test_a_narrow_console_gets_fewer_columns_not_broken_ones(table, width):
     assert "left out for want of width: trained s" in text
 
 
+def test_lines_below_the_table_break_between_words(table):
+    narrow, wide = (drawn(table, width).partition("protocol strict")[2] for width in (80, 500))
+    assert max(map(len, narrow.splitlines())) <= 80
+    assert max(map(len, wide.splitlines())) > 100
+    narrow, _, _ = narrow.partition("left out for want of width")
+    assert wide.split()[: len(narrow.split())] == narrow.split()
+
+
 def test_the_answers_give_way_last():
     """At 80 columns the verdicts, the error one second ahead and the distance to the floor are there; what all rows share is
     not, and neither are the costs of training."""

@@ -319,9 +319,7 @@ def show_verdicts(verdicts: Sequence["Comparison"], family: int, entries: Sequen
             unit = entries[0].unit if metric.endswith("_mae") else None
             title = f"{TITLES[metric]}{f', {unit}' if unit else ''}"
             if len(rows) > MANY and len({(row.word, row.words) for row in rows}) == 1:
-                console.print(
-                    f"{title}: all {len(rows)} pairs: {escape(rows[0].word)}: {escape(rows[0].words)}", soft_wrap=True
-                )
+                console.print(f"{title}: all {len(rows)} pairs: {escape(rows[0].word)}: {escape(rows[0].words)}")
                 continue
             grid, gave_way = _fit(title, rows, short, console)
             left_out += [head for head in gave_way if head not in left_out]
@@ -332,7 +330,7 @@ def show_verdicts(verdicts: Sequence["Comparison"], family: int, entries: Sequen
     narrow = [f"left out for want of width: {', '.join(left_out)} (all in --json)"] if left_out else []
     notes = [line for line in _footnotes(verdicts, family, entries) if line.split(":")[0] not in left_out]
     for line in (*notes, *narrow):
-        console.print(escape(line), style="dim", soft_wrap=True)
+        console.print(escape(line), style="dim")
     console.print()
 
 

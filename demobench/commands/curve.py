@@ -115,10 +115,10 @@ def _show(found: Mapping[str, Any], folder: Path, console: Console) -> None:
     console.print(table)
     colours = {"yes": "green", "no": "yellow", "cannot tell": "cyan"}
     for answer in found["answers"]:
-        console.print(f"[{colours[answer['word']]}]{escape(answer['words'])}[/]", soft_wrap=True)
+        console.print(f"[{colours[answer['word']]}]{escape(answer['words'])}[/]")
     if found["floor"] is None:
         words = "No floor is known for the first-step error: none was measured, or its estimator refused"
-        console.print(f"[dim]{words} (demobench floor says why).[/]", soft_wrap=True)
+        console.print(f"[dim]{words} (demobench floor says why).[/]")
     for path in found["pictures"]:
         console.print(f"  Picture  {escape(short(path))}", soft_wrap=True)
 

@@ -81,7 +81,7 @@ def show_estimates(estimates: Sequence[FloorEstimate], facts: Mapping[str, Any],
         )
     console.print(table)
     for number, reason in enumerate(reasons, 1):
-        console.print(f"[yellow]({number})[/] {escape(reason)}", soft_wrap=True)
+        console.print(f"[yellow]({number})[/] {escape(reason)}")
     console.print(
         "A floor belongs to its observation set: a policy that sees more may go below it. RMSE: squared errors, extrapolated to "
         "states that look exactly alike (gamma). MAE and L2: the floor lies between the two ends (pair distance).\n",
@@ -105,10 +105,10 @@ def show_radius(floors: Sequence[RadiusFloor], console: Console) -> None:
     console.print(table)
     for floor in floors:
         if floor.refused:
-            console.print(f"[yellow]{escape(floor.observations)}:[/] {escape(floor.refused)}", soft_wrap=True)
+            console.print(f"[yellow]{escape(floor.observations)}:[/] {escape(floor.refused)}")
     console.print(
-        "This is the notebook's estimator, kept to reproduce published numbers. It is biased: a group's own mean is inside the "
-        "group, neighbours may be copies in time, only dense places count, and a wide radius adds the variation of the mean. "
-        "It is an L2 distance, so it bounds no mean absolute error.",
+        "This is the estimator of the notebook that this project grew from, kept to reproduce its published numbers. It is "
+        "biased: a group's own mean is inside the group, neighbours may be copies in time, only dense places count, and a wide "
+        "radius adds the variation of the mean. It is an L2 distance, so it bounds no mean absolute error.",
         style="dim",
     )

@@ -51,13 +51,13 @@ def show_inspection(facts: Mapping[str, Any], console: Console, said_by_checks: 
     grid, left_out = _columns(facts, console)
     console.print(grid)
     if left_out:
-        console.print(f"left out for want of width: {', '.join(left_out)} (all in --json)", style="dim", soft_wrap=True)
+        console.print(f"left out for want of width: {', '.join(left_out)} (all in --json)", style="dim")
     for camera in facts["cameras"]:
         there = "there" if camera["present"] else "declared, but its files are absent"
         console.print(f"camera {plain(camera['key'])} {camera['width']}×{camera['height']}: {there}", soft_wrap=True)
     for warning in facts["warnings"]:
         if warning not in said_by_checks:
-            console.print(f"[yellow]note:[/] {plain(warning)}", soft_wrap=True)
+            console.print(f"[yellow]note:[/] {plain(warning)}")
     console.print()
     _show_findings(facts["findings"], facts["skipped"], console)
     _show_episodes(facts, console)

@@ -146,7 +146,6 @@ def _show(
         console.print(
             f"[yellow]left out of {escape(policy)}:[/] {'; '.join(ways)} (more than the chunk has, or a delay longer than what is "
             "executed)",
-            soft_wrap=True,
         )
     console.print(
         f"Stepped in: the share of frames in which the safety layer changed an action by more than {percent(TOLERANCE)} of a "
@@ -154,7 +153,6 @@ def _show(
         f"Intervals ({_intervals(rows[0])}) are of each row alone: the best of many is partly luck. Roll it out again from "
         "start states that chose nothing (--from).",
         style="dim",
-        soft_wrap=True,
     )
 
 

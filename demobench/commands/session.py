@@ -59,9 +59,14 @@ def open_dataset(argument: str, session: Session, choices: Choices | None = None
     """The data set of a name, folder or Hub address, and what its columns mean."""
     from pipeline.lerobot_format.read import load_experiment
 
-    registered = session.store.experiments()
-    target = resolve_target(argument, session.config, session.config_dir, choices or Choices(), registered)
+    target = known_target(argument, session, choices)
     return target, *load_experiment(target.experiment, session.config_dir)
+
+
+def known_target(argument: str, session: Session, choices: Choices | None = None) -> Target:
+    """What a data set's name, folder or Hub address means here."""
+    registered = session.store.experiments()
+    return resolve_target(argument, session.config, session.config_dir, choices or Choices(), registered)
 
 
 def stored_plan(name: str, session: Session) -> "Plan":

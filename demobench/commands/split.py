@@ -103,7 +103,6 @@ def show_split(found: Mapping[str, Any], console: Console) -> None:
         "To train elsewhere without the held-out episodes: --format lerobot (LeRobot's trainer) or --format json (any other; "
         "demobench score --trained-on reads it).",
         style="dim",
-        soft_wrap=True,
     )
 
 

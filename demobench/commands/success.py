@@ -102,14 +102,13 @@ def show_success(found: Mapping[str, Any], console: Console) -> None:
     if found["comparisons"]:
         console.print(_comparisons(found["comparisons"]))
     for row in [*found["policies"], *found["comparisons"]]:
-        console.print(escape(row["words"]), soft_wrap=True)
+        console.print(escape(row["words"]))
     if len(found["policies"]) == 1:
         console.print("One count alone says nothing about another policy: give two to compare them.", style="dim")
     elif any(pair["fisher"] is not None for pair in found["comparisons"]):
         console.print(
             "The verdict is by the test that is named. Fisher's, beside it, is exact too but conservative: it misses more.",
             style="dim",
-            soft_wrap=True,
         )
 
 

@@ -1,11 +1,13 @@
 """`demobench view`: one episode in Rerun, as it was recorded and as every policy would have done."""
 
+import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from demobench.commands.session import Session, open_dataset, open_session
-from pipeline.errors import ConfigError, did_you_mean
+from demobench.commands.session import Session, known_target, open_dataset, open_session
+from pipeline.errors import ConfigError, NotApplicableError, did_you_mean
 from pipeline.experiment import Target, parse_list
 
 
@@ -25,7 +27,7 @@ def view_episode(
     from pipeline.sinks import to_rerun
 
     session = open_session(config_path, store_path)
-    target, demos, semantics = open_dataset(argument, session)
+    target, demos, semantics = _opened(argument, session)
     position = np.flatnonzero(demos.episode_ids == episode)
     if episode in demos.excluded:
         raise ConfigError(
@@ -45,6 +47,11 @@ def view_episode(
                 f"No up-to-date predictions of a policy '{name}' for '{target.key}'. {did_you_mean(name, names)}"
             )
     predictions = [load_predictions(plan.folder(u)) for u in units if not wanted or u.policy in wanted]
+    if save is None and not has_screen():
+        raise NotApplicableError(
+            "There is no screen here for Rerun's viewer to open on. Write the episode to a file, and open it where there is one: "
+            f"demobench view {argument} {episode} --save FILE.rrd"
+        )
     frames = demos.episode(int(position[0]))
     if not any(len(p.in_frames(frames)) for p in predictions):
         session.console.print(_why_no_predictions(episode, predictions, demos, target, session), soft_wrap=True)
@@ -53,8 +60,34 @@ def view_episode(
     to_rerun.write_rerun(path, demos, semantics, predictions, [int(position[0])], name=f"{target.key} {episode}")
     if save:
         session.console.print(f"Written to {save}. Open it with: rerun --bind 127.0.0.1 {save}", soft_wrap=True)
-    else:
-        to_rerun.view(path)
+    elif to_rerun.view(path).returncode:
+        raise NotApplicableError(
+            "Rerun's viewer could not be opened; what it said is above. Write the episode to a file, and open it elsewhere: "
+            f"demobench view {argument} {episode} --save FILE.rrd"
+        )
+
+
+def has_screen() -> bool:
+    """Whether a window can be opened: not on a Linux machine without a display."""
+    return not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+
+
+def _opened(argument: str, session: Session) -> tuple[Target, Any, Any]:
+    """The data set, with the settings that there are results of: where it has none as it is, and some with one other choice of
+    settings, those."""
+    target = known_target(argument, session)
+    others = _with_results(target, session)
+    if target.key not in others and len(others) == 1:
+        session.console.print(f"The results of {others[0]}, the only settings that '{argument}' was benchmarked with.")
+        argument = others[0]
+    return open_dataset(argument, session)
+
+
+def _with_results(target: Target, session: Session) -> list[str]:
+    """The keys under which this data set has a table, whatever its settings."""
+    base, store = target.key.split("+")[0], session.store
+    keys = [key for key in store.experiments() if key.split("+")[0] == base]
+    return [key for key in keys if (store.folder(key, "benchmark_table")).exists()]
 
 
 def _why_no_predictions(episode: int, predictions: Sequence[Any], demos: Any, target: Target, session: Session) -> str:
@@ -62,11 +95,7 @@ def _why_no_predictions(episode: int, predictions: Sequence[Any], demos: Any, ta
     import numpy as np
 
     if not predictions:
-        base = target.key.split("+")[0]
-        finished = [
-            key for key in session.store.experiments() if (session.store.folder(key, "benchmark_table")).exists()
-        ]
-        others = [key for key in finished if key.split("+")[0] == base and key != target.key]
+        others = [key for key in _with_results(target, session) if key != target.key]
         known = f" There are results of {', '.join(others)}." if others else ""
         return (
             f"'{target.key}' has no up-to-date predictions in {session.store.root}; showing the recording alone.{known}"

@@ -114,10 +114,10 @@ def _tested(table: Table) -> list[str]:
 def _floor_words(radius: Mapping[str, Any]) -> str:
     unit = f" {radius['unit']}" if radius.get("unit") else ""
     return (
-        f"Radius floor on {radius.get('observations', 'the state')}, as the notebook takes it (biased, kept for "
-        f"comparison): mean distance {show(radius['mean'])}{unit}, 90th percentile {show(radius['p90'])}{unit}, "
-        f"{plural(radius['probes'], 'probe')}, median group {show(radius['median_neighbours'], 0)} frames. It is an "
-        "L2 distance: no bound on a mean absolute error."
+        f"Radius floor on {radius.get('observations', 'the state')}, as the notebook that this project grew from takes "
+        f"it (biased, kept for comparison): mean distance {show(radius['mean'])}{unit}, 90th percentile "
+        f"{show(radius['p90'])}{unit}, {plural(radius['probes'], 'probe')}, median group "
+        f"{show(radius['median_neighbours'], 0)} frames. It is an L2 distance: no bound on a mean absolute error."
     )
 
 
@@ -151,9 +151,9 @@ def _notebook(table: Table, history: int) -> dict[str, str]:
     second = round(table["dataset"]["fps"])
     return {
         "Protocol": (
-            "“notebook” reproduces published numbers and shares their weaknesses: normalisation has seen the "
-            "held-out episodes, each chunk size is scored on its own windows, and frames rather than episodes are "
-            "averaged. The default is “strict”."
+            "“notebook” reproduces the published numbers of the notebook that this project grew from, and shares their "
+            "weaknesses: normalisation has seen the held-out episodes, each chunk size is scored on its own windows, "
+            "and frames rather than episodes are averaged. The default is “strict”."
         ),
         "First-step MAE": (
             "|predicted − recorded| of the first action, averaged over action columns, over held-out windows and "

@@ -96,8 +96,9 @@ def _generator_table(cells: Sequence[Cell]) -> str:
             "D₀ (mae) too high by, %", "D₀ (l2) too high by, %", "radius / l2 floor"]  # fmt: skip
     words = "\n".join(f"- `{g.name}`: {g.words}, {_columns(g.dimensions)}" for g in GENERATORS.values())
     about = (
-        f"{words}\n\n`answered` counts numbers, and upper limits where the floor is zero. `radius` is the notebook's estimator: "
-        "the mean distance of actions to their group's own mean, over the floor of the L2 error.\n\n"
+        f"{words}\n\n`answered` counts numbers, and upper limits where the floor is zero. `radius` is the estimator of the "
+        "notebook that this project grew from ([protocols](protocols.md)): the mean distance of actions to their group's own "
+        "mean, over the floor of the L2 error.\n\n"
     )
     return "## Floors, generator by generator\n\n" + about + table(head, rows)
 

@@ -48,8 +48,7 @@ def render_table(table: Mapping[str, Any], console: "Console", marked: str | Non
     console.print()
     console.print(
         f"[bold]{escape(dataset['name'])}[/]  {dataset['episodes']:,} episodes · {dataset['frames']:,} frames · "
-        f"{dataset['fps']:g} fps · {len(dataset['action_names'])} action columns ({_units_words(dataset)})",
-        soft_wrap=True,
+        f"{dataset['fps']:g} fps · {len(dataset['action_names'])} action columns ({_units_words(dataset)})"
     )
     grid, left_out = _grid(table, unit, console, marked)
     console.print(grid)
@@ -60,9 +59,9 @@ def render_table(table: Mapping[str, Any], console: "Console", marked: str | Non
     console.print()
     narrow = [f"left out for want of width: {', '.join(left_out)} (all in --json)"] if left_out else []
     for line in (*_footnotes(table), *narrow):
-        console.print(escape(line), style="dim", soft_wrap=True)
+        console.print(escape(line), style="dim")
     for warning in dataset["warnings"]:
-        console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
+        console.print(f"[yellow]warning:[/] {escape(warning)}")
     console.print()
 
 
@@ -302,7 +301,7 @@ def _footnotes(table: Mapping[str, Any]) -> list[str]:
     if radius and radius["mean"] is not None:
         unit = f" {radius['unit']}" if radius["unit"] else ""
         lines.append(
-            f"floor by radius (the notebook's, biased), L2, '{radius['observations']}': "
+            f"floor by radius (the estimator of the notebook that this project grew from; biased), L2, '{radius['observations']}': "
             f"mean {radius['mean']:.2f}{unit}, 90th percentile {radius['p90']:.2f}{unit}, {radius['probes']} probes; "
             "it bounds no MAE"
         )

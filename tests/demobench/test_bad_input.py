@@ -42,7 +42,7 @@ def run(benchmark: TinyBenchmark, monkeypatch, raw: dict) -> tuple[dict, str, De
         run_benchmarks(["tiny"], choices=choices, config_path=None, store_path=None, json_to=str(said))
     except DemobenchError as error:
         failure = error
-    return json.loads(said.read_text())[0], console.export_text(), failure
+    return json.loads(said.read_text())[0], " ".join(console.export_text().split()), failure
 
 
 def changed(number: int, **dataset) -> dict:

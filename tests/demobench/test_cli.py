@@ -147,7 +147,31 @@ def test_view_finds_a_variant_by_its_key_and_says_why_there_is_nothing(place, fi
     out = demobench("view", key, trained, "--save", "variant.rrd", cwd=place)
     assert f"Episode {trained} was trained on" in " ".join(out.stdout.split())
     out = demobench("view", "tape", held_out, "--save", "variant.rrd", cwd=place)
-    assert f"There are results of {key}" in " ".join(out.stdout.split())
+    assert f"The results of {key}, the only settings that 'tape' was benchmarked with" in " ".join(out.stdout.split())
+    assert "no up-to-date predictions" not in out.stdout
+
+
+def test_view_without_a_screen_is_one_message(place, first_run):
+    environment = {key: value for key, value in ENVIRONMENT.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    command = [sys.executable, "-m", "demobench.cli", "view", "tape", "0"]
+    out = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert out.returncode == 2
+    assert "error: There is no screen here" in out.stderr
+    assert "demobench view tape 0 --save FILE.rrd" in " ".join(out.stderr.split())
+    assert len(out.stderr.splitlines()) <= 2
+
+
+def test_a_folder_is_viewed_where_its_name_is_another_s(place, first_run, tmp_path):
+    """Its results are under a key with a hash, and with other settings than a bare `run`."""
+    other = write_v3(tmp_path / "tape", tiny_recording(episodes=6, frames=30, seed=3))
+    made = demobench("run", other, *QUICK, "--json", "other.json", cwd=place)
+    assert made.returncode == 0, made.stderr
+    table = json.loads((place / "other.json").read_text())[0]
+    assert table["key"].startswith("tape-")
+    out = demobench("view", other, table["split"]["folds"][0]["test"][0], "--save", "other.rrd", cwd=place)
+    assert out.returncode == 0, out.stderr
+    assert f"The results of {table['key']}" in " ".join(out.stdout.split())
+    assert "no up-to-date predictions" not in out.stdout
 
 
 def test_debug_shows_the_traceback(place):
