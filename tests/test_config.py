@@ -6,12 +6,22 @@ import pytest
 
 from pipeline.config import AugmentConfig, Config, PolicyConfig, check_slug, hash_of, load_config, parse_config
 from pipeline.errors import ConfigError
+from pipeline.experiment import from_config
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def test_shipped_file_is_the_built_in_default():
     assert load_config(ROOT / "demobench.toml") == Config()
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "experiments").glob("*.toml")), ids=lambda file: file.stem)
+def test_every_experiment_of_the_docs_is_read(file):
+    config = load_config(file)
+    ((name, dataset),) = config.datasets.items()
+    made = from_config(config, name, file.parent)
+    assert dataset.champion.split("/")[0] in [variant.name for variant in made.variants]
+    assert file.name in (ROOT / "docs" / "closed_loop.md").read_text()
 
 
 @pytest.mark.parametrize(
