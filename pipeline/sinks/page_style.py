@@ -94,9 +94,10 @@ th, td {
   padding: 6px 7px; border-top: 1px solid var(--line);
   font-weight: 400; text-align: right; vertical-align: top; white-space: nowrap;
 }
-thead th { font-weight: 600; vertical-align: bottom; font-size: 13px; line-height: 1.3; }
+thead th { font-weight: 600; vertical-align: bottom; font-size: 13px; line-height: 1.3; white-space: normal; }
 td small, th small { display: block; color: var(--muted); font-size: 12px; font-weight: 400; line-height: 1.35; }
 td small.beside { display: inline; }
+td small.late { white-space: normal; }
 td b { font-weight: inherit; }
 td.best, td.best b { font-weight: 700; }
 td.none { color: var(--muted); }

@@ -218,7 +218,7 @@ def _stepped_in(table: Mapping[str, Any]) -> list[Column]:
 
     def by_how_much(row: Row, shown: str) -> Html | str:
         size = _of(row, "mean_intervention")
-        return join(shown, element("small", f"by {percent(size)} of a range")) if is_number(size) else shown
+        return join(shown, element("small", f"by {percent(size)}")) if is_number(size) else shown
 
     return [Column("Safety", "stepped in, % of frames", share, None, by_how_much, 2)]
 
@@ -228,8 +228,8 @@ def _late(row: Row, shown: str) -> Html | str:
     late = row.get("latency_p99_ms")
     if not is_number(late):
         return shown
-    words = f"99 %: {show(late, 3)}" + (", misses its deadline" if row["misses_deadline"] else "")
-    return join(shown, element("small", words))
+    missed = element("small", "misses its deadline", class_="late") if row["misses_deadline"] else None
+    return join(shown, element("small", f"99 %: {show(late)}"), missed)
 
 
 def _count(value: float) -> str:

@@ -119,8 +119,8 @@ def test_what_is_behind_closed_loop_numbers_is_said(table, figures):
     }  # fmt: skip
     page = text_of(render_report(table, figures, PROVENANCE))
     assert "stepped in, % of frames" in page
-    assert "1.23 by 25 % of a range" in page
-    assert "99 %: 250.000, misses its deadline" in page
+    assert "1.23 by 25 %" in page
+    assert "99 %: 250 misses its deadline" in page
     assert "One call in a hundred of mlp_k04 takes 250 ms or more on this machine, and it is asked every 100 ms" in page
     assert "No roll-outs of mlp_k01: it does not fit." in page
     table["policies"][1]["rollouts"] = None
