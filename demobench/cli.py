@@ -280,6 +280,29 @@ def rollouts(
 
 @app.command(
     epilog="""Examples:\n
+    demobench proxy pusht_sim                                every offline score against success\n
+    demobench proxy pusht_sim so101_sim                      named on the first, tested on the second\n
+    demobench proxy pusht_sim so101_sim --observations pose --chunks 16 --json -"""
+)
+def proxy(
+    datasets: Annotated[
+        list[str],
+        typer.Argument(metavar="DATASET [DATASET2]", help="Data sets with a simulator that were benchmarked."),
+    ],
+    observations: Annotated[str | None, typer.Option(help="Only these observation sets: position,pose")] = None,
+    chunks: Annotated[str | None, typer.Option(help="Only these chunk sizes: 1,16")] = None,
+    config: ConfigOption = None,
+    store: StoreOption = None,
+    json_to: JsonOption = None,
+) -> None:
+    """Does a smaller offline error mean more success? Over the trained networks in the store; with two data sets, tested."""
+    from demobench.commands.proxy import run_proxy
+
+    run_proxy(datasets, observations=observations, chunks=chunks, config_path=config, store_path=store, json_to=json_to)
+
+
+@app.command(
+    epilog="""Examples:\n
     demobench export tape/mlp_k16 mlp_k16.onnx\n
     demobench export pusht_sim/act_k16/pose act.onnx --seed 2 --json -"""
 )

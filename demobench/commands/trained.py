@@ -1,8 +1,9 @@
-"""Trained policies in the store, found by their address: what `rollouts` and `export` begin with.
+"""Trained policies in the store, found by their address: what `rollouts`, `export` and `proxy` begin with.
 
 What does not belong here: what is done with them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from pipeline.errors import ConfigError, StoreError, did_you_mean
 from pipeline.experiment import Variant
 
 if TYPE_CHECKING:
-    from assets_defs.plan import Plan
+    from assets_defs.plan import Plan, Unit
     from pipeline.folds import PolicyTask
 
 
@@ -54,6 +55,13 @@ def find_trained(text: str, session: Session) -> list[Found]:
     return _load(plan, variants, _the_set(address, plan, variants[0]))
 
 
+def trained_in(plan: "Plan") -> list[Found]:
+    """All trained policies of a data set's experiment whose weights are up to date, one a policy and observation set."""
+    units = [(v, u) for v in plan.variants if v.is_trained for u in plan.policy_units(v, "trained_policy")]
+    fresh = [(variant, unit) for variant, unit in units if plan.is_fresh(unit)]
+    return _found(plan, fresh) if fresh else []
+
+
 def _the_set(address: Address, plan: "Plan", variant: Variant) -> str:
     """The observation set that an address means."""
     sets = [s.name for s in plan.experiment.sets_of(variant)]
@@ -72,7 +80,6 @@ def _the_set(address: Address, plan: "Plan", variant: Variant) -> str:
 
 def _load(plan: "Plan", variants: list[Variant], observations: str) -> list[Found]:
     from assets_defs.plan import Unit
-    from pipeline.folds import PolicyTask
 
     units = {v: Unit(f"{v.name}/trained_policy", observations) for v in variants}
     fresh = {v: unit for v, unit in units.items() if plan.is_fresh(unit)}
@@ -81,11 +88,17 @@ def _load(plan: "Plan", variants: list[Variant], observations: str) -> list[Foun
             f"There are no up-to-date weights of {', '.join(v.name for v in variants)} ({observations}) in {plan.store.root}. "
             f"Train with: demobench run {plan.key} --policies {variants[0].family}"
         )
-    data = _data(plan)
-    the_set = next(s for s in plan.experiment.observation_sets if s.name == observations)
+    return _found(plan, list(fresh.items()))
+
+
+def _found(plan: "Plan", fresh: "Sequence[tuple[Variant, Unit]]") -> list[Found]:
+    """Weights that are up to date, with the tasks that they were trained for."""
+    from pipeline.folds import PolicyTask
+
+    data, sets = _data(plan), {s.name: s for s in plan.experiment.observation_sets}
     return [
-        Found(plan, PolicyTask(*data, the_set, v, plan.experiment), plan.folder(unit), plan.fingerprint(unit))
-        for v, unit in fresh.items()
+        Found(plan, PolicyTask(*data, sets[unit.entry], v, plan.experiment), plan.folder(unit), plan.fingerprint(unit))
+        for v, unit in fresh
     ]
 
 

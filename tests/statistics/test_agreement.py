@@ -20,30 +20,9 @@ from pipeline.statistics.agreement import (
     spearman,
     within_methods,
 )
+from speed.agreement import drawn
 
 SCORES = {"whole_chunk_mae": "the whole-chunk error", "executed_mae": "the executed error"}
-
-
-def drawn(sizes, between, within, random, *, seeds=2, share=0.6, ties=False):
-    """Errors, outcomes, methods and policies of checkpoints: method, policy and seed effects of both, correlated as given.
-
-    sizes: policies of each method. ties: success over 50 start states, none for about half of the checkpoints.
-    """
-
-    def effect(correlation, variance):
-        x, e = random.normal(size=2)
-        return np.sqrt(variance) * np.array([x, correlation * x + math.sqrt(1 - correlation**2) * e])
-
-    rows = []
-    for m, policies in enumerate(sizes):
-        of_method = effect(between, share)
-        for p in range(policies):
-            of_policy = effect(within, 0.8 * (1 - share))
-            rows += [(m, p, *(of_method + of_policy + effect(within, 0.2 * (1 - share)))) for _ in range(seeds)]
-    method, policy, good, outcome = np.array(rows).T
-    if ties:
-        outcome = random.binomial(50, np.clip(0.35 * outcome, 0, 1) ** 1.5) / 50
-    return -good, outcome, method.astype(int), policy.astype(int)
 
 
 def checkpoints(sizes, between, within, seed, *, seeds=2, starts=50, **more):
