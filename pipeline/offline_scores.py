@@ -32,10 +32,10 @@ from pipeline.statistics.metrics import circular_actions, episode_errors, estima
 from pipeline.types import ACTION, Demonstrations, EpisodeErrors, Execution, Predictions, Semantics
 
 SCORES = {
-    "whole_chunk_mae": "the whole-chunk error (MAE)",
-    "executed_mae": "the error over the executed actions (MAE)",
-    "energy": "the energy score of the executed actions",
-    "near_contact_mae": "the error near contact (MAE)",
+    "whole_chunk_mae": "whole-chunk error",
+    "executed_mae": "error over the executed actions",
+    "energy": "energy score of the executed actions",
+    "near_contact_mae": "error near contact",
 }
 """Score → what it is called, the plain one first."""
 

@@ -262,6 +262,7 @@ def _row(c: "Checkpoint") -> dict[str, Any]:
 
 def _show(one: Gathered, agreed: Agreed, console: Console) -> None:
     """What there is, a table a target, and what was left out."""
+    from pipeline.offline_scores import SCORES
     from pipeline.statistics.agreement import describe, refusal
 
     said = describe(one.checkpoints)
@@ -282,6 +283,8 @@ def _show(one: Gathered, agreed: Agreed, console: Console) -> None:
         ceilings = _ceilings(one, agreed)
         for target, found in agreed.items():
             console.print(_table(target, found, ceilings[target]))
+            for score in filter(lambda one: one.refused, found):
+                console.print(f"No {SCORES[score.score]}: {escape(score.refused)}.", style="dim", soft_wrap=True)
         near = (
             one.near if isinstance(one.near, str) else f"{100 * one.near.mean():.0f} % of the frames are near contact"
         )
@@ -303,7 +306,7 @@ def _table(target: str, found: Sequence["Agreement"], most: float | None) -> Tab
         table.add_column(head, justify="left" if head == "offline score" else "right")
     for one in found:
         if one.overall is None:
-            table.add_row(SCORES[one.score], "–", escape(one.refused), *["–"] * 4)
+            table.add_row(SCORES[one.score], *["–"] * 6)
             continue
         within = (
             [f"{one.within.value:.2f}", _interval(one.within), _p(one.within), str(one.within.methods)]
@@ -333,7 +336,7 @@ def _show_answers(
     best = name_best(said[0]["success"])
     if not answers and best is not None:
         console.print(
-            f"Highest on this data set: {SCORES[best.score]}. The highest of several is partly luck: name a second data set "
+            f"Highest on this data set: the {SCORES[best.score]}. The highest of several is partly luck: name a second data set "
             f"to test it on, as in demobench proxy {escape(found[0].key)} ANOTHER",
             soft_wrap=True,
         )

@@ -341,14 +341,18 @@ def answer(
         return Answer(target, None, "cannot tell", None, None, None, None, words)
     here = next(one for one in second if one.score == named.score)
     name = scores[named.score]
-    begins = f"Named on the first data set: {name} (correlation {named.overall.value:.2f} with the {_called(target)})."
+    begins = (
+        f"Named on the first data set: the {name} (correlation {named.overall.value:.2f} with the {_called(target)})."
+    )
     if here.overall is None:
         words = f"{begins} Cannot tell whether it predicts on the second: {here.refused}."
         return Answer(target, named.score, "cannot tell", None, None, None, None, words)
     word, needs = _above_zero(here.overall)
     plain = next((one for one in second if one.score == PLAIN), None)
     difference = (
-        _difference(tested_on, named.score, target) if named.score != PLAIN and plain and plain.overall else None
+        difference_to_plain(tested_on, named.score, target)
+        if named.score != PLAIN and plain and plain.overall
+        else None
     )
     over = None if difference is None else _over_plain(*difference)
     words = " ".join(
@@ -374,7 +378,7 @@ def methods_needed(size: float, se: float, methods: int) -> int | None:
     return None
 
 
-def _difference(checkpoints: Sequence[Checkpoint], score: str, target: Target) -> tuple[float, Interval | None]:
+def difference_to_plain(checkpoints: Sequence[Checkpoint], score: str, target: Target) -> tuple[float, Interval | None]:
     """The correlation of a score less that of the whole-chunk error, over the same checkpoints, with its interval over methods."""
     outcome = np.array([c.outcome(target).mean() for c in checkpoints])
     method = np.array([c.method for c in checkpoints])
@@ -429,9 +433,9 @@ def _over_words(over: str | None, difference: tuple[float, Interval | None] | No
     at = f"{value:+.2f}" + (f" {_bracketed(interval)}" if interval else "")
     plain = scores[PLAIN]
     return {
-        "better": f"It is better than {plain}: {at}.",
-        "worse": f"It is worse than {plain}: {at}.",
-        "cannot tell": f"Whether it is better than {plain}: cannot tell ({at}).",
+        "better": f"It is better than the {plain}: {at}.",
+        "worse": f"It is worse than the {plain}: {at}.",
+        "cannot tell": f"Whether it is better than the {plain}: cannot tell ({at}).",
     }[over]
 
 
