@@ -37,7 +37,9 @@ def test_two_counts():
 
 def test_one_count_says_what_it_pins_down():
     out = run("18/20")
-    assert "20 trials, so the rate is known to about ± 15 points: it lies between 68 and 99 %" in " ".join(out.stdout.split())
+    assert "20 trials, so the rate is known to about ± 15 points: it lies between 68 and 99 %" in " ".join(
+        out.stdout.split()
+    )
     assert "give two to compare them" in out.stdout
     assert "Comparisons" not in out.stdout
 
