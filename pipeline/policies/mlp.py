@@ -4,7 +4,8 @@ What belongs here: their sizes and rates, and what goes in and comes out. What d
 and their training (`fitting`), training of single networks (`networks`).
 
 Left alone, or with other sizes and rates, it is the plain network, all seeds trained as one stack. Residual blocks, schedules
-and a view of its own (relative actions, derived features, augmentation) are trained one network a seed.
+and a view of its own (relative actions, derived features, augmentation) are trained one network a seed. Departures: it answers
+numbers rather than one of some directions, for a whole chunk of frames, and its loss is L1 unless told otherwise.
 """
 
 from collections.abc import Mapping

@@ -92,6 +92,10 @@ def test_it_loads_to_the_same_predictions_and_does_not_depend_on_its_batch(windo
     save_trained(trained, tmp_path)
     together = trained.policy.predict(seen)
     np.testing.assert_array_equal(load_trained(tmp_path).policy.predict(seen), together)
+    order = np.random.default_rng(0).permutation(len(together[0]))
+    np.testing.assert_allclose(
+        trained.policy.predict(windows.observations(order)), together[:, order], rtol=1e-4, atol=1e-5
+    )
     alone = trained.policy.predict(windows.observations(slice(40, 41)))
     np.testing.assert_allclose(alone[:, 0], together[:, 40], rtol=1e-4, atol=1e-5)
 

@@ -1,5 +1,8 @@
 """What every trained method of ours owes, whatever it is: it learns, and its answers and bytes can be relied on."""
 
+import importlib
+import re
+
 import numpy as np
 import pytest
 
@@ -56,6 +59,13 @@ def asked(seen: Observations, rows) -> Observations:
 def test_every_method_with_settings_is_tested_here():
     """But what needs a camera, which has a file of its own (`test_image`)."""
     assert set(ALL) == {method for method in SETTINGS if not METHODS[method].camera}
+
+
+@pytest.mark.parametrize("method", SETTINGS)
+def test_its_file_names_the_paper_that_it_follows_and_where_it_departs(method):
+    about = importlib.import_module(METHODS[method].module).__doc__
+    assert re.search(r"\b(19|20)\d\d\b", about)
+    assert "Departures" in about
 
 
 @pytest.mark.parametrize("method", ALL)
@@ -119,6 +129,14 @@ def test_a_killed_training_goes_on_to_the_same_bytes(method, tmp_path):
     np.testing.assert_array_equal(curve.losses, whole_curve.losses)
     for name, array in whole.arrays().items():
         np.testing.assert_array_equal(resumed.arrays()[name], array)
+
+
+def test_what_trains_nothing_is_the_same_bytes_when_it_is_made_again():
+    """Where there are no steps there is no checkpoint: a killed run begins anew, and ends in the same."""
+    first, again = train("lwr").policy.arrays(), train("lwr").policy.arrays()
+    assert first.keys() == again.keys()
+    for name, array in first.items():
+        np.testing.assert_array_equal(again[name], array)
 
 
 @pytest.mark.parametrize("method", NETWORKS)

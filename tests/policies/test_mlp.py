@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from pipeline.errors import PolicyError
+from pipeline.methods import METHODS
 from pipeline.policies import Plan
 from pipeline.policies.mlp import Mlp
 from pipeline.policies.notebook_pusht import NotebookPushT
+from pipeline.train import train_policy
 from pipeline.types import ACTION, STATE
 from pipeline.windows import make_windows
 from tests.hand_made import STATE_ONLY, demonstrations, random_walks, semantics
@@ -55,6 +57,21 @@ def test_answers_are_chunks_of_every_seed_in_raw_units():
     assert 90 < answer.mean() < 115
     np.testing.assert_allclose(policy.one_seed(1).predict(windows.observations(slice(0, 7)))[0], answer[1], rtol=1e-5)
     assert policy.one_seed(1).seeds == (1,)
+
+
+@pytest.mark.parametrize("method", ["mlp", "notebook_pusht"])
+def test_the_plain_network_overfits_one_episode_and_answers_alone_as_in_company(method):
+    turn = np.linspace(0, 2 * np.pi, 40)
+    state = 100 * np.column_stack([np.cos(turn), np.sin(turn)])
+    demos = demonstrations({STATE: state, ACTION: np.roll(state, -1, axis=0)}, (40,))
+    settings = {"statistics_episodes": (0,), "protocol": "strict", "history": 2, "recipe": METHODS[method].recipe}
+    windows = make_windows(demos, semantics(demos), STATE_ONLY, (0,), chunk=1, **settings)
+    policy = train_policy(method, windows, seeds=(1,), steps=400).policy
+    (actions, inside), together = windows.targets(), policy.predict(windows.observations())
+    error = np.abs(together[0] - actions)[inside].mean()
+    assert error < 0.15 * np.abs(actions - actions.mean(axis=(0, 1)))[inside].mean()
+    alone = policy.predict(windows.observations(slice(7, 8)))
+    np.testing.assert_allclose(alone[:, 0], together[:, 7], rtol=1e-3, atol=1e-3)
 
 
 def test_an_angle_that_wraps_is_answered_across_the_seam():

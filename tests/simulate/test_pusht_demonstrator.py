@@ -13,7 +13,7 @@ from pipeline.simulate.pusht_card import card
 from pipeline.simulate.pusht_demonstrator import record_pusht
 from pipeline.simulate.pusht_planner import Planner, State
 from pipeline.simulate.recording import Recording, start_number
-from pipeline.types import ACTION, STATE
+from pipeline.types import ACTION, STATE, ColumnChoice
 
 EPISODES = 2
 
@@ -39,6 +39,8 @@ def test_the_embedded_data_can_be_recorded_again(recorded):
     assert set(again.columns) == set(first.columns)
     for key, values in again.columns.items():
         np.testing.assert_array_equal(values, first.columns[key][frames], err_msg=key)
+    later = ColumnChoice(exclude=tuple(range(EPISODES, first.episodes)))
+    assert again.content_hash == read_dataset(embedded, name="pusht_sim", choice=later).content_hash
 
 
 def test_the_number_of_processes_changes_nothing(recorded, tmp_path):
