@@ -38,6 +38,15 @@ RAW = {
         "mlp": {"method": "mlp", "chunks": [4, 16], "execute": 4},
         "net": {"method": "mlp", "chunks": [4], "settings": {"blocks": 1, "width": 8}, "observations": ["pose"]},
         "late": {"method": "mlp", "chunks": [4], "only_when_named": True},
+        "recipe": {
+            "method": "mlp", "chunks": [4], "observations": ["pose"], "history": 2, "actions": "relative",
+            "features": "pusht_block_frame", "augment": {"noise": {"px": 1.0, "rad": 0.02}, "symmetry": "pusht_mirror"},
+            "steps": 2, "execute": 2, "delay": 1,
+            "settings": {
+                "blocks": 1, "width": 8, "loss": "huber", "dropout": 0.1, "warmup": 1, "cosine": True, "clip": 1.0, "ema": True,
+                "bf16": True,
+            },
+        },
     },
 }  # fmt: skip
 
@@ -126,6 +135,20 @@ def test_several_seeds_act_from_the_same_start_states(session, tmp_path):
     assert row["score"] == pytest.approx(np.mean([first.best_reward, second.best_reward]))
     assert [one["seed"] for one in row["per_seed"]] == [0, 1]
     assert "seeds 0 to 1 of fold 0" in session.console.export_text()
+
+
+def test_every_key_of_a_policy_reaches_its_training_and_its_roll_outs(session):
+    (one,) = find_trained("tiny/recipe/pose", session)
+    said = RAW["policies"]["recipe"]
+    view = {"actions": "relative", "features": "pusht_block_frame", **said["augment"]}
+    assert (one.task.training["given"], one.task.training["steps"]) == (view, 2)
+    policy = load_fold(one.task, one.folder, 0)
+    assert policy.made_with.model_dump().items() >= said["settings"].items()
+    assert (policy.transform.history, policy.transform.relative.tolist()) == (2, [True, True])
+    assert policy.transform.derived[0] == "pusht_block_frame"
+    assert json.loads((one.folder / "fold_0/training.json").read_text())["steps"][-1] == 2
+    rolled = roll_out(one.task, one.folder)
+    assert (rolled.execution, len(rolled.success)) == (Execution(2, delay=1), 2)
 
 
 @pytest.mark.parametrize(
