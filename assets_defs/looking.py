@@ -1,8 +1,9 @@
 """What is looked at: held-out episodes beside what every policy predicted, for MCAP readers and for Rerun; roll-outs as a video."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import dagster as dg
 
@@ -25,7 +26,7 @@ EPISODES = 10
 
 def looking_assets(deps: Sequence[dg.AssetKey], rollouts: Sequence[dg.AssetKey]) -> list[dg.AssetsDefinition]:
     """Both recordings and the videos; `deps` are the predictions of every policy, `rollouts` its roll-outs."""
-    return [_rollout_video(rollouts), _mcap_log(deps), _rerun_recording([*deps, VIDEO])]
+    return [_rollout_video(rollouts), _mcap_log([*deps, VIDEO]), _rerun_recording([*deps, VIDEO])]
 
 
 def _held_out(bench: Bench) -> list[int]:
@@ -54,7 +55,9 @@ def _mcap_log(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
         """Held-out episodes as ROS 2 `sensor_msgs/JointState`: the archive that any MCAP reader opens.
 
         `/joint_states` is what the robot did, `/joint_commands` what the person commanded, `/policy/<policy>/<observations>`
-        the first action each policy would have taken. Times are the demonstration's own clock.
+        the first action each policy would have taken, `/camera/<name>` the picture of each frame, `/rollout/…` what policies did
+        in closed loop. Times are the demonstration's own clock. Attached are the settings, the split and the data's hash. Of a
+        file that was cut off, `demobench view FILE.mcap` recovers what is there, and says how far.
         """
         bench = workbench.open(context, budget)
         unit = Unit("mcap_log")
@@ -64,6 +67,8 @@ def _mcap_log(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
             "file": dg.MetadataValue.path(str(path)),
             "open_with": f"demobench view {bench.plan.key} {made.summary['episodes'][0]}",
             "messages": made.summary["messages"],
+            "size_mb": made.summary["size_mb"],
+            "cameras left out": table(["why"], [(why,) for why in made.summary["left_out"]]),
         }
         return result(bench, MCAP, {"": made}, metadata, ["readable"])
 
@@ -71,16 +76,15 @@ def _mcap_log(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
 
 
 def _write_mcap(bench: Bench, draft) -> Outcome:
-    from pipeline.sinks.to_mcap import count_messages, expected_messages, write_mcap
+    from pipeline.sinks.to_mcap import count_messages, write_mcap
 
     path = draft / "held_out.mcap"
     episodes = _held_out(bench)
-    predictions = _predictions(bench)
-    write_mcap(
+    written = write_mcap(
         path,
         bench.demonstrations,
         bench.semantics,
-        predictions,
+        _predictions(bench),
         episodes,
         metadata={
             "data_set": bench.experiment.name,
@@ -88,12 +92,35 @@ def _write_mcap(bench: Bench, draft) -> Outcome:
             "split": bench.split.hash,
             "protocol": bench.experiment.protocol,
         },
+        attachments={
+            "benchmark.json": bench.experiment.model_dump(mode="json"),
+            "split.json": asdict(bench.split),
+            "data.json": _data(bench),
+        },
+        driven=_driven(bench),
     )
-    found, written = count_messages(path), expected_messages(bench.demonstrations, predictions, episodes)
+    found = count_messages(path)
     return Outcome(
-        {"messages": found, "episodes": _recorded_ids(bench, episodes)},
-        {"readable": (found == written, f"{found:,} of {written:,} messages")},
+        {
+            "messages": found,
+            "episodes": _recorded_ids(bench, episodes),
+            "size_mb": round(path.stat().st_size / 1e6, 2),
+            "left_out": written.left_out,
+        },
+        {"readable": (found == written.messages, f"{found:,} of {written.messages:,} messages")},
     )
+
+
+def _data(bench: Bench) -> dict[str, Any]:
+    """What the demonstrations are, for a file that leaves the store."""
+    demos = bench.demonstrations
+    return {
+        "name": demos.name,
+        "source": bench.experiment.dataset.source,
+        "revision": demos.revision,
+        "content_hash": demos.content_hash,
+        "excluded": list(demos.excluded),
+    }
 
 
 def _recorded_ids(bench: Bench, episodes: list[int]) -> list[int]:

@@ -34,7 +34,7 @@ CODE_VERSIONS = {
     "benchmark_table": "7",
     "benchmark_report": "9",
     "rollout_video": "1",
-    "mcap_log": "1",
+    "mcap_log": "2",
     "rerun_recording": "2",
 }
 """Raised by hand when what an asset computes changes: everything downstream becomes stale."""
@@ -246,6 +246,7 @@ class Plan:
                 policies += self.scored_units()
                 shown = {
                     "benchmark_report": [Unit("benchmark_table"), Unit("rollout_video"), *self.curves()],
+                    "mcap_log": [Unit("rollout_video")],
                     "rerun_recording": [Unit("rollout_video")],
                 }
                 return [*shown.get(unit.kind, []), *policies]

@@ -425,19 +425,35 @@ def score(
     )
 
 
-@app.command(epilog="Examples:\n\n    demobench view pusht_sim 0\n\n    demobench view pusht_sim 0 --save episode.rrd")
+@app.command(
+    epilog="Examples:\n\n    demobench view pusht_sim 0\n\n    demobench view so101_sim 42 --policy mlp_k16\n\n"
+    "    demobench view pusht_sim 0 --save episode.rrd\n\n    demobench view held_out.mcap"
+)
 def view(
-    dataset: Annotated[str, typer.Argument(help="A data set that was benchmarked.")],
-    episode: Annotated[int, typer.Argument(help="The episode's recorded number.")],
+    dataset: Annotated[
+        str, typer.Argument(help="A data set that was benchmarked; or a recording, FILE.mcap or FILE.rrd.")
+    ],
+    episode: Annotated[int | None, typer.Argument(help="The episode's recorded number.")] = None,
     policy: Annotated[str | None, typer.Option(help="Only these policies.")] = None,
-    save: Annotated[Path | None, typer.Option(help="Write a Rerun recording instead of opening the viewer.")] = None,
+    save: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write a Rerun recording (or what is recovered of an MCAP file) instead of opening the viewer."
+        ),
+    ] = None,
     config: ConfigOption = None,
     store: StoreOption = None,
 ) -> None:
-    """Look at one episode in Rerun: what was recorded, and what every policy would have done."""
-    from demobench.commands.view import view_episode
+    """Look at one episode in Rerun: what was recorded, and what every policy would have done.
 
-    view_episode(dataset, episode, policy, save, config, store)
+    An MCAP file that was cut off is recovered as far as it goes.
+    """
+    from demobench.commands.view import is_recording, view_episode, view_file
+
+    if is_recording(dataset) and episode is None:
+        view_file(Path(dataset), save)
+    else:
+        view_episode(dataset, episode, policy, save, config, store)
 
 
 @app.command(epilog="Examples:\n\n    demobench selftest\n\n    demobench selftest --full --page docs/known_truth.md")

@@ -1,10 +1,12 @@
-"""`demobench view`: one episode in Rerun, as it was recorded and as every policy would have done."""
+"""`demobench view`: one episode in Rerun, as it was recorded and as every policy would have done; or a recording's file."""
 
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from rich.console import Console
 
 from demobench.commands.session import Session, known_target, open_dataset, open_session
 from pipeline.errors import ConfigError, NotApplicableError, did_you_mean
@@ -13,7 +15,7 @@ from pipeline.experiment import Target, parse_list
 
 def view_episode(
     argument: str,
-    episode: int,
+    episode: int | None,
     policy: str | None,
     save: Path | None,
     config_path: Path | None,
@@ -27,6 +29,8 @@ def view_episode(
     from pipeline.sinks import to_rerun
 
     session = open_session(config_path, store_path)
+    if episode is None:
+        raise ConfigError(f"Which episode of '{argument}'? Say its number: demobench view {argument} 0")
     target, demos, semantics = _opened(argument, session)
     position = np.flatnonzero(demos.episode_ids == episode)
     if episode in demos.excluded:
@@ -65,6 +69,37 @@ def view_episode(
             "Rerun's viewer could not be opened; what it said is above. Write the episode to a file, and open it elsewhere: "
             f"demobench view {argument} {episode} --save FILE.rrd"
         )
+
+
+def view_file(path: Path, save: Path | None) -> None:
+    """A recording that lies somewhere: `.rrd`, or `.mcap`, of which what is left is recovered where it was cut off."""
+    from pipeline.sinks import to_rerun
+    from pipeline.sinks.mcap_recovery import is_whole, recover
+
+    if path.suffix == ".rrd" or is_whole(path):
+        if save:
+            raise ConfigError(
+                f"{path} is a whole recording, so there is nothing for --save to write. Copy it where you need it."
+            )
+    else:
+        target = save or path.with_name(f"{path.stem}_recovered.mcap")
+        words = recover(path, target)
+        Console(highlight=False).print(f"{path} was cut off: {words}. Written to {target}.", soft_wrap=True)
+        if save or not has_screen():
+            return
+        path = target
+    if not has_screen():
+        raise NotApplicableError(
+            f"There is no screen here for Rerun's viewer to open on. Open {path} where there is one: rerun --bind 127.0.0.1 {path}"
+        )
+    if to_rerun.view(path).returncode:
+        raise NotApplicableError(
+            f"Rerun's viewer could not open {path}; what it said is above. Any MCAP reader opens an .mcap."
+        )
+
+
+def is_recording(argument: str) -> bool:
+    return Path(argument).suffix in (".mcap", ".rrd")
 
 
 def has_screen() -> bool:

@@ -40,6 +40,11 @@ class Driven:
     def drawing(self) -> Drawing:
         return drawing_of(self.rollouts.simulator)
 
+    def words(self, row: int) -> str:
+        """Which start state, and how it ended."""
+        word = self.drawing.done if self.rollouts.success[row] else "failed"
+        return f"start state {self.rollouts.start_states[row]}: {word}, {self.rollouts.steps[row] / self.drawing.fps:.1f} s"
+
     def root(self, row: int | None = None) -> str:
         """The entity of all, or of one start state, by its number."""
         import rerun as rr
@@ -77,9 +82,7 @@ def rollouts_tab(driven: Driven) -> Any:
 def _view(driven: Driven, row: int) -> Any:
     import rerun.blueprint as rrb
 
-    rollouts, drawing = driven.rollouts, driven.drawing
-    word = drawing.done if rollouts.success[row] else "failed"
-    name = f"start state {rollouts.start_states[row]}: {word}, {rollouts.steps[row] / drawing.fps:.1f} s"
+    drawing, name = driven.drawing, driven.words(row)
     if not isinstance(drawing.view, Camera):
         (left, top), (right, bottom) = drawing.view.low, drawing.view.high
         bounds = rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom])

@@ -16,6 +16,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from pipeline.sinks.words import common_unit
 from pipeline.types import ACTION, STATE, Demonstrations, Predictions, Semantics
 
 EPISODE = "episode_"
+VIEWER = "rerun_cli"
 HIDDEN_AT_FIRST = ("constant_velocity", "mean_action")
 Rgb = tuple[int, int, int]
 
@@ -97,11 +99,16 @@ def view(path: Path, *, wait: bool = True) -> subprocess.Popen:
     """Open a recording in Rerun's viewer, whose server listens on this machine only (127.0.0.1, any free port).
 
     Raises:
-        StoreError: there is no such recording, or the viewer cannot be started.
+        StoreError: there is no such recording, or the viewer is not installed or cannot be started.
     """
     if not path.is_file():
         raise StoreError(f"There is no recording at {path}. `demobench run` writes one.")
-    command = [sys.executable, "-m", "rerun_cli", "--bind", "127.0.0.1", "--port", "auto", str(path)]
+    if find_spec(VIEWER) is None:
+        raise StoreError(
+            f"Rerun's viewer is not installed here; it comes with rerun-sdk: pip install rerun-sdk==0.41.0. Or open "
+            f"{path} on a machine that has it."
+        )
+    command = [sys.executable, "-m", VIEWER, "--bind", "127.0.0.1", "--port", "auto", str(path)]
     try:
         viewer = subprocess.Popen(command)
     except OSError as error:

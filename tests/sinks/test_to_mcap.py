@@ -1,5 +1,7 @@
 """MCAP files are read back by the tools that people have: the `mcap` reader with ROS 2 decoding, and rosbags."""
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +12,26 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from pipeline.errors import StoreError
-from pipeline.sinks.to_mcap import GAP_S, policy_topics, write_mcap
-from pipeline.types import ACTION, STATE
+from pipeline.lerobot_format.quality import resolve_semantics
+from pipeline.lerobot_format.read import read_dataset
+from pipeline.sinks.rerun_rollouts import Driven
+from pipeline.sinks.to_mcap import GAP_S, count_messages, policy_topics, write_mcap
+from pipeline.types import ACTION, STATE, Feature
+from tests.filming import (
+    KEY,
+    PATH_V2,
+    WITH_B_FRAMES,
+    WITHOUT,
+    as_png,
+    filmed_v2,
+    filmed_v3,
+    numbers_in_packets,
+    with_pictures,
+    write_mp4,
+)
+from tests.makers import tiny_recording
 
+from .driving import BLOCK, make_driven
 from .making import make_demos, make_predictions, make_semantics
 
 POLICY = "/policy/mlp_k04/state"
@@ -143,3 +162,98 @@ def test_a_folder_that_cannot_be_written_is_one_clear_message(tmp_path, demos, s
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(StoreError, match=r"a\.mcap cannot be written: .*choose another folder"):
         write_mcap(tmp_path / "file" / "a.mcap", demos, semantics, [], [0], metadata={})
+
+
+def test_settings_split_and_data_are_attached(tmp_path, demos, semantics):
+    held = {"split.json": {"folds": [[0], [1]]}, "data.json": {"content_hash": demos.content_hash}}
+    write_mcap(tmp_path / "a.mcap", demos, semantics, [], [0], metadata={}, attachments=held)
+    with (tmp_path / "a.mcap").open("rb") as file:
+        found = {one.name: (one.media_type, json.loads(one.data)) for one in make_reader(file).iter_attachments()}
+    assert found == {name: ("application/json", value) for name, value in held.items()}
+
+
+@pytest.mark.parametrize(
+    ("film", "options", "codec"),
+    [(filmed_v2, WITHOUT, "h264"), (filmed_v3, WITH_B_FRAMES, "h264"), (with_pictures, None, "png")],
+)
+def test_the_picture_at_time_t_is_that_of_the_frame_at_time_t(tmp_path, film, options, codec):
+    recording = tiny_recording(3, (13, 20, 9))
+    folder = film(tmp_path / "set", recording, *([] if options is None else ["libx264", options]))
+    demos = read_dataset(folder, name="set")
+    uneven = demos.timestamps + np.random.default_rng(0).uniform(0, 0.04, demos.frames)
+    demos = replace(demos, timestamps=uneven)
+    written = write_mcap(tmp_path / "a.mcap", demos, resolve_semantics(demos), [], [2, 1], metadata={})
+    found = read(tmp_path / "a.mcap")
+    pictures = found["/camera/top"]
+    assert written.left_out == []
+    assert written.messages == count_messages(tmp_path / "a.mcap") == 2 + 3 * (9 + 20)
+    assert [time for time, _ in pictures] == [time for time, _ in found["/joint_states"]]
+    frames = [*range(33, 42), *range(13, 33)]
+    data = [bytes(message.data) for _, message in pictures]
+    assert {message.format for _, message in pictures} == {codec}
+    if codec == "png":
+        assert data == [as_png(number) for number in frames]
+        stamps = [message.header.stamp for _, message in pictures]
+    else:
+        shown = numbers_in_packets(codec, data[:9]) + numbers_in_packets(codec, data[9:])
+        assert shown == frames
+        stamps = [message.timestamp for _, message in pictures]
+    assert [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps] == [time for time, _ in pictures]
+
+
+def test_rosbags_reads_the_camera_too(tmp_path):
+    demos = read_dataset(filmed_v2(tmp_path / "set", tiny_recording(1, 12)), name="set")
+    write_mcap(tmp_path / "a.mcap", demos, resolve_semantics(demos), [], [0], metadata={})
+    with AnyReader([tmp_path / "a.mcap"]) as reader:
+        (camera,) = [c for c in reader.connections if c.topic == "/camera/top"]
+        packets = [bytes(reader.deserialize(raw, camera.msgtype).data) for _, _, raw in reader.messages([camera])]
+        joints = next(c for c in reader.connections if c.topic == "/joint_states")
+        names = [reader.deserialize(raw, joints.msgtype).name for _, _, raw in reader.messages([joints])]
+    assert camera.msgtype == "foxglove_msgs/msg/CompressedVideo"
+    assert numbers_in_packets("h264", packets) == list(range(12))
+    assert names == [["joint_0", "joint_1"]] * 12
+
+
+def test_a_video_of_another_length_is_left_out_and_said_so(tmp_path):
+    folder = filmed_v2(tmp_path / "set", tiny_recording(2, 12))
+    write_mp4(folder / PATH_V2.format(episode_chunk=0, video_key=KEY, episode_index=1), range(5))
+    demos = read_dataset(folder, name="set")
+    written = write_mcap(tmp_path / "a.mcap", demos, resolve_semantics(demos), [], [0, 1], metadata={})
+    (why,) = written.left_out
+    assert why.startswith(f"camera '{KEY}': ")
+    assert "holds 5 pictures of episode 1, which has 12 frames" in why
+    found = read(tmp_path / "a.mcap")
+    assert (len(found["/camera/top"]), len(found["/joint_states"])) == (12, 24)
+    with (tmp_path / "a.mcap").open("rb") as file:
+        said = next(one.metadata for one in make_reader(file).iter_metadata() if one.name == "cameras")
+    assert said["/camera/top"].startswith(f"{KEY}, 64×48; h264, as in the data set; left out: ")
+
+
+def test_a_video_that_is_declared_and_missing_is_left_out_and_said_so(tmp_path):
+    folder = filmed_v2(tmp_path / "set", tiny_recording(2, 12))
+    shutil.rmtree(folder / "videos")
+    demos = read_dataset(folder, name="set")
+    written = write_mcap(tmp_path / "a.mcap", demos, resolve_semantics(demos), [], [0, 1], metadata={})
+    assert written.left_out == [
+        f"camera '{KEY}': The videos of '{KEY}' that meta/ declares are not in {folder}. Copy the folder videos/ too."
+    ]
+    assert "/camera/top" not in read(tmp_path / "a.mcap")
+
+
+def test_roll_outs_follow_the_episodes_each_start_state_by_itself(tmp_path, demos, semantics):
+    block = Feature(BLOCK, ("block_x", "block_y", "block_angle"), ("px", "px", "rad"))
+    demos = replace(demos, features=dict(demos.features) | {BLOCK: block})
+    rollouts = make_driven((10, 6))
+    driven = Driven(rollouts, rollouts.scenes, None, None)
+    written = write_mcap(tmp_path / "a.mcap", demos, semantics, [], [0], metadata={}, driven=[driven])
+    found, root = read(tmp_path / "a.mcap"), "/rollout/mlp_k04/state"
+    said = found[f"{root}/start_state"]
+    assert [message.data for _, message in said] == ["start state 7: on target, 1.0 s", "start state 8: failed, 0.6 s"]
+    states = found[f"{root}/joint_states"]
+    np.testing.assert_allclose([m.position for _, m in states][:11], rollouts.scenes.shown[STATE][0, :11])
+    np.testing.assert_allclose([m.position for _, m in states][11:], rollouts.scenes.shown[STATE][1, :7])
+    assert states[0][1].name == ["x", "y"]
+    assert found[f"{root}/environment_state"][0][1].name == list(block.names)
+    assert states[11][0] == said[1][0]
+    assert states[0][0] > found["/joint_states"][-1][0]
+    assert written.messages == 1 + 2 * 30 + 2 + 2 * (11 + 7)

@@ -258,3 +258,9 @@ def test_the_viewer_listens_on_this_machine_only(recording, monkeypatch):
 def test_viewing_what_is_not_there_says_what_to_do(tmp_path):
     with pytest.raises(StoreError, match=r"no recording at .*none\.rrd.*demobench run"):
         view(tmp_path / "none.rrd")
+
+
+def test_a_viewer_that_is_not_installed_is_one_clear_message(recording, monkeypatch):
+    monkeypatch.setattr(to_rerun, "VIEWER", "a_viewer_that_nobody_installed")
+    with pytest.raises(StoreError, match=r"viewer is not installed here.*pip install rerun-sdk.*held_out\.rrd"):
+        view(recording)
