@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import dagster as dg
 
@@ -17,6 +18,9 @@ from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec,
 from assets_defs.show import interval_words, picture, present, table
 from pipeline.experiment import Variant
 from pipeline.methods import EXTERNAL
+
+if TYPE_CHECKING:
+    from pipeline.sinks.to_mlflow import Message
 
 TABLE = dg.AssetKey(["benchmark_table"])
 REPORT = dg.AssetKey(["benchmark_report"])
@@ -115,7 +119,20 @@ def _write_table(bench: Bench, draft) -> Outcome:
             "baselines_present": ("hold_still" in names, f"{len(rows)} rows"),
             "same_data": (hashes == {bench.split.hash}, f"split {bench.split.hash[:16]}"),
         },
+        crown(bench, bench.experiment.dataset.champion),
     )
+
+
+def crown(bench: Bench, champion: str | None) -> list["Message"]:
+    """MLflow's registry is told whose model has the alias `champion`: that of a row, `policy/observations`, or of a policy that
+    has one row."""
+    from pipeline.sinks.to_mlflow import about_champion
+
+    rows = [u for u in bench.plan.fresh_policy_units("predictions") if champion in (f"{u.policy}/{u.entry}", u.policy)]
+    if len(rows) != 1:
+        return []
+    variant = next(v for v in bench.plan.variants if v.name == rows[0].policy)
+    return [about_champion(bench.run_card(variant, rows[0].entry))]
 
 
 def _rolled_out(bench: Bench, unit: Unit) -> dict:

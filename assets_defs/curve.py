@@ -11,7 +11,6 @@ from pydantic import Field
 from assets_defs.data import PARTITIONS, episode_split
 from assets_defs.floor import ESTIMATES, multimodality_floor
 from assets_defs.plan import CODE_VERSIONS, Plan, Unit, curve_unit, sizes_of
-from assets_defs.policies import mlflow_run, tracking
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import picture, present, table
 from pipeline.config import hash_of
@@ -128,7 +127,7 @@ def curves_asked(
 def _draw_curve(bench: Bench, unit: Unit, draft: Path) -> Outcome:
     """Train on every subset, keep the errors by size, and say what they mean."""
     from pipeline.curve import curve_sizes, full_size, train_subsets
-    from pipeline.sinks import to_mlflow
+    from pipeline.sinks.to_mlflow import about_curve
     from pipeline.statistics.curve_reading import errors_file, keep_errors
     from pipeline.statistics.metrics import load_errors, save_errors
 
@@ -150,8 +149,6 @@ def _draw_curve(bench: Bench, unit: Unit, draft: Path) -> Outcome:
             save_errors(errors, draft / errors_file(size, order))
     save_errors(full, draft / errors_file(full_size(task.split), 0))
     said = _describe(bench, task, draft)
-    run_id = mlflow_run(bench, task, Unit(f"{policy}/trained_policy", observations))
-    to_mlflow.log_curve(tracking(bench), run_id, said["sizes"])
     table_value = bench.summary(predictions)["metrics"]["first_step_mae"]
     same = all(
         (e.episodes == full.episodes).all() and (e.anchors == full.anchors).all() for o in by_size.values() for e in o
@@ -163,6 +160,11 @@ def _draw_curve(bench: Bench, unit: Unit, draft: Path) -> Outcome:
             "ends_in_the_table": (abs(last - table_value) <= 1e-9 * abs(table_value), f"{last:.6g}"),
             "same_episodes": (bool(same), f"{len(full.episodes)} held-out episodes"),
         },
+        [
+            about_curve(
+                bench.run_card(task.variant, observations), said["sizes"], sorted(p.name for p in draft.glob("*.png"))
+            )
+        ],
     )
 
 

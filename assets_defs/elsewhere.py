@@ -9,8 +9,7 @@ from pydantic import Field
 
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
 from assets_defs.plan import SCORED, Plan, Unit
-from assets_defs.policies import tracking
-from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
+from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, mlflow_links, result
 from assets_defs.show import picture, present, table
 from pipeline.config import check_slug
 from pipeline.errors import ConfigError, did_you_mean
@@ -128,13 +127,12 @@ def elsewhere_assets() -> list[dg.AssetsDefinition]:
             f"error_by_horizon_{name}": picture(bench.plan.folder(Unit(SCORED, name)) / "error_by_horizon.png")
             for name in made
         }
-        links = {f"mlflow_{name}": dg.MetadataValue.text(m.summary["mlflow_run_id"]) for name, m in made.items()}
         header = ["name", "observations", "first-step MAE", "episodes", "training"]
         return result(
             bench,
             KEY,
             made,
-            present({"scores": table(header, rows), **pictures, **links}),
+            present({"scores": table(header, rows), **pictures, **mlflow_links(made)}),
             ["aligned", "whole_episodes"],
         )
 
@@ -147,7 +145,7 @@ def _make(bench: Bench, config: ScoreConfig):
     trained_on = Path(config.trained_on) if config.trained_on else None
     request = Request(config.name, Path(config.predictions), trained_on, config.observations or None)
     plan = replace(bench.plan, asked={config.name: request.identity(bench.demonstrations)}, _memo={})
-    asked = Bench(bench.workbench, plan, bench.progress)
+    asked = replace(bench, plan=plan)
     return asked.make(Unit(SCORED, config.name), lambda draft: _score(asked, request, draft))
 
 
@@ -155,8 +153,8 @@ def _score(bench: Bench, request: Request, draft: Path) -> Outcome:
     from pipeline.external.scoring import ELSEWHERE, score_file
     from pipeline.external.training import read_training
     from pipeline.predict import save_predictions
-    from pipeline.sinks import to_mlflow
     from pipeline.sinks.pictures import picture_horizons
+    from pipeline.sinks.to_mlflow import about_scores, run_card
     from pipeline.statistics.metrics import save_errors
 
     demos = bench.demonstrations
@@ -176,27 +174,26 @@ def _score(bench: Bench, request: Request, draft: Path) -> Outcome:
     picture_horizons(scored.score.metrics, request.name, everyone, demos, draft / "error_by_horizon.png")
     summary = scored.summary(demos)
     asked = bench.plan.asked[request.name]
-    run_id = to_mlflow.log_elsewhere(
-        tracking(bench),
-        experiment=bench.plan.key,
-        task=scored.task,
-        seeds=scored.predictions.seeds,
-        metrics=scored.score.metrics,
-        seed_metrics=scored.score.seed_metrics,
-        samples=scored.samples and scored.samples["by_horizon"],
+    changes = {"seeds": len(scored.predictions.seeds), "steps": "unknown"}
+    if scored.task.observation_set not in bench.experiment.observation_sets:
+        changes["features"] = "unknown"
+    run = run_card(
+        scored.task,
+        bench.plan.key,
+        bench.plan.fingerprint(Unit(SCORED, request.name)),
         tags={
-            "fingerprint": bench.plan.fingerprint(Unit(SCORED, request.name)),
+            "external": "true",
             "predictions_sha256": asked["sha256"],
             "training": scored.held_out.words,
             "seen_in_training": {True: "true", False: "false", None: "unknown"}[scored.held_out.seen],
         },
-        artifacts=[draft / "error_by_horizon.png"],
+        changes=changes,
     )
+    samples = {f"samples_{name}": values for name, values in (scored.samples or {}).get("by_horizon", {}).items()}
     return Outcome(
         {
             **summary,
             "asked": asked,
-            "mlflow_run_id": run_id,
             "observations": request.observations or ELSEWHERE,
             "split_hash": bench.split.hash,
             "file": str(request.predictions),
@@ -205,6 +202,15 @@ def _score(bench: Bench, request: Request, draft: Path) -> Outcome:
             "aligned": (True, "; ".join(scored.warnings) or "nothing fits better"),
             "whole_episodes": (True, f"{summary['windows_test']:,} anchors of {len(summary['episodes'])} episodes"),
         },
+        [
+            about_scores(
+                run,
+                scored.predictions.seeds,
+                scored.score.metrics | samples,
+                scored.score.seed_metrics,
+                ["error_by_horizon.png"],
+            )
+        ],
     )
 
 

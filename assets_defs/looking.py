@@ -164,8 +164,9 @@ def _write_videos(bench: Bench, draft: Path) -> Outcome:
     from pipeline.errors import NotApplicableError, StoreError
     from pipeline.simulate.scene_files import load_scenes
     from pipeline.sinks.rollout_video import count_frames, write_video
+    from pipeline.sinks.to_mlflow import Message
 
-    videos, left_out, found = [], {}, 0
+    videos, told, left_out, found = [], [], {}, 0
     for place, (unit, rollouts) in enumerate(_best_driven(bench)):
         bench.progress(f"video {unit.entry}", place, place + 1, "")
         path = draft / f"{unit.entry}.mp4"
@@ -180,11 +181,13 @@ def _write_videos(bench: Bench, draft: Path) -> Outcome:
             found += count_frames(path)
             size = {"file": path.name, "kb": round(path.stat().st_size / 1e3)}
             videos.append(video.summary() | size)
-            _to_mlflow(bench, unit, path)
+            variant = next(v for v in bench.plan.variants if v.name == unit.policy)
+            told.append(Message(bench.run_card(variant, unit.entry), files=[path.name]))
     written = sum(video["frames"] for video in videos)
     return Outcome(
         {"videos": videos, "left_out": left_out},
         {"whole": (found == written, f"{found:,} of {written:,} frames in {len(videos)} videos")},
+        told,
     )
 
 
@@ -200,15 +203,6 @@ def _best_driven(bench: Bench) -> Iterator[tuple[Unit, "Rollouts"]]:
         said = {u: bench.summary(u)["rollouts"] for u in units if u.entry == observations}
         best = max(said, key=lambda u: (said[u]["success"], said[u]["score"]))
         yield best, load_rollouts(bench.plan.folder(best))[0]
-
-
-def _to_mlflow(bench: Bench, unit: Unit, path: Path) -> None:
-    from assets_defs.policies import mlflow_run, tracking
-    from pipeline.sinks.to_mlflow import log_file
-
-    variant = next(v for v in bench.plan.variants if v.name == unit.policy)
-    trained = Unit(f"{variant.name}/trained_policy", unit.entry)
-    log_file(tracking(bench), mlflow_run(bench, bench.task(variant, unit.entry), trained), path)
 
 
 def driven_videos(bench: Bench) -> list[tuple["Video", Path]]:

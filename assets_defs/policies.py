@@ -12,7 +12,7 @@ import dagster as dg
 
 from assets_defs.data import PARTITIONS, demonstrations, episode_split, windows
 from assets_defs.plan import Unit
-from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
+from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, mlflow_links, result
 from assets_defs.show import picture, present, table
 from pipeline.experiment import Variant
 from pipeline.store import Made
@@ -46,22 +46,6 @@ def _everyone(bench: Bench) -> list[str]:
     return [v.name for v in bench.plan.variants]
 
 
-def tracking(bench: Bench) -> str:
-    """Where MLflow is."""
-    from pipeline.sinks.to_mlflow import tracking_uri
-
-    return tracking_uri(bench.workbench.config.tracking.mlflow, bench.store.root)
-
-
-def mlflow_run(bench: Bench, task, trained: Unit) -> str:
-    """The MLflow run of a trained policy."""
-    from pipeline.sinks.to_mlflow import find_run
-
-    fingerprint = {"fingerprint": bench.plan.fingerprint(trained)}
-    run_id = bench.summary(trained)["mlflow_run_id"]
-    return find_run(tracking(bench), run_id, experiment=bench.plan.key, task=task, tags=fingerprint)
-
-
 def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
     asset_key = dg.AssetKey([variant.name, "trained_policy"])
     method = "a baseline: nothing is trained" if not variant.is_trained else f"method `{variant.method}`"
@@ -89,13 +73,12 @@ def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
             )
             for entry, m in made.items()
         ]
-        links = {f"mlflow_{entry}": dg.MetadataValue.text(m.summary["mlflow_run_id"]) for entry, m in made.items()}
         plots = {
             f"losses_{unit.entry}": picture(bench.plan.folder(unit) / "losses.png")
             for unit in bench.plan.selected_units(variant, "trained_policy")
         }
         header = ["observations", "parameters", "steps", "training s", "CPU s", "GPU memory, MB", "last loss"]
-        metadata = {"training": table(header, rows), **plots, **links}
+        metadata = {"training": table(header, rows), **plots, **mlflow_links(made)}
         return result(bench, asset_key, made, present(metadata), ["finite_losses"])
 
     return trained_policy
@@ -105,8 +88,8 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
     import numpy as np
 
     from pipeline.folds import train_folds
-    from pipeline.sinks import to_mlflow
     from pipeline.sinks.pictures import picture_losses
+    from pipeline.sinks.to_mlflow import about_training
 
     task = bench.task(variant, unit.entry)
     unfinished = bench.store.dataset(bench.plan.key) / ".unfinished" / bench.plan.fingerprint(unit)
@@ -122,14 +105,6 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
     last = float(np.mean([t.losses[:, -1].mean() for t in folds])) if known else None
     if known:
         picture_losses(folds[0], variant.name, _everyone(bench), draft / "losses.png")
-    run_id = to_mlflow.log_training(
-        tracking(bench),
-        experiment=bench.plan.key,
-        task=task,
-        trained=folds,
-        weights=draft / "fold_0",
-        tags={"fingerprint": bench.plan.fingerprint(unit)},
-    )
     shutil.rmtree(unfinished, ignore_errors=True)
     return Outcome(
         {
@@ -139,7 +114,6 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
             "cpu_s": sum(t.cpu_s for t in folds),
             "vram_mb": max(t.vram_mb for t in folds),
             "last_loss": last,
-            "mlflow_run_id": run_id,
         },
         {
             "finite_losses": (
@@ -147,6 +121,14 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
                 "no losses are known" if last is None else f"{last:.4g}",
             )
         },
+        [
+            about_training(
+                bench.run_card(variant, unit.entry),
+                folds,
+                task.seeds if variant.is_trained else (),
+                "fold_0" if variant.is_trained else None,
+            )
+        ],
     )
 
 
@@ -199,8 +181,8 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
     from pipeline.folds import predict_folds
     from pipeline.predict import save_predictions
     from pipeline.sampling import sampled_scores
-    from pipeline.sinks import to_mlflow
     from pipeline.sinks.pictures import picture_horizons
+    from pipeline.sinks.to_mlflow import about_scores
     from pipeline.statistics.metrics import save_errors, score_task
 
     task = bench.task(variant, unit.entry)
@@ -213,13 +195,6 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
     save_predictions(predicted, draft)
     save_errors(score.errors, draft / "errors.safetensors")
     picture_horizons(score.metrics, variant.name, _everyone(bench), task.demos, draft / "error_by_horizon.png")
-    to_mlflow.log_scores(
-        tracking(bench),
-        mlflow_run(bench, task, trained_unit),
-        score.metrics | _series_of(samples),
-        score.seed_metrics,
-        artifacts=[draft / "error_by_horizon.png"],
-    )
     held_out = set(task.split.held_out)
     scored = set(score.errors.episodes.tolist())
     return Outcome(
@@ -228,6 +203,15 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
             "finite": (not broken, f"{broken:,} of {predicted.actions.size:,} numbers are not finite"),
             "every_held_out_episode": (scored == held_out, f"{len(scored)} of {len(held_out)} episodes"),
         },
+        [
+            about_scores(
+                bench.run_card(variant, unit.entry),
+                task.seeds,
+                score.metrics | _series_of(samples),
+                score.seed_metrics,
+                ["error_by_horizon.png"],
+            )
+        ],
     )
 
 
@@ -267,7 +251,7 @@ def _rollouts(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDefini
 def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
     from pipeline.errors import ConfigError, NotApplicableError, PolicyError
     from pipeline.simulate.trial import roll_out, save_rollouts
-    from pipeline.sinks import to_mlflow
+    from pipeline.sinks.to_mlflow import about_rollouts
     from pipeline.statistics.closed_loop import summarise_rollouts
 
     task, trained_unit = bench.task(variant, unit.entry), Unit(f"{variant.name}/trained_policy", unit.entry)
@@ -283,11 +267,14 @@ def _roll_out(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcom
         return Outcome({"rollouts": None, "why_not": str(why)}, {"sane": (True, str(why))})
     save_rollouts(results, draft)
     summary = summarise_rollouts(results)
-    to_mlflow.log_rollouts(tracking(bench), mlflow_run(bench, task, trained_unit), summary)
     in_range = all(((one.best_reward >= 0) & (one.best_reward <= 1)).all() for one in results)
     agree = all((one.best_reward[one.success] >= 1).all() for one in results)
     words = [f"{summary['successes']} of {summary['episodes']} succeeded, score {summary['score']:.3f}"]
     words += [
         f"{s} {count}" for s, count in zip(summary.get("stages", ()), summary.get("stage_counts", ()), strict=True)
     ]
-    return Outcome({"rollouts": summary, "why_not": None}, {"sane": (bool(in_range and agree), ", ".join(words))})
+    return Outcome(
+        {"rollouts": summary, "why_not": None},
+        {"sane": (bool(in_range and agree), ", ".join(words))},
+        [about_rollouts(bench.run_card(variant, unit.entry), summary)],
+    )

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import dagster as dg
 from pydantic import Field
@@ -19,6 +19,10 @@ from pipeline.config import Config, hash_of
 from pipeline.errors import ConfigError, did_you_mean
 from pipeline.experiment import Choices, Experiment, Variant, from_config, variant_key, with_choices
 from pipeline.store import Made, Meter, Store
+
+if TYPE_CHECKING:
+    from pipeline.sinks.mlflow_outbox import Outbox
+    from pipeline.sinks.to_mlflow import Message, RunCard
 
 Say = Callable[[str], None]
 
@@ -45,10 +49,12 @@ class Outcome:
 
     summary   small and JSON-able; kept in made.json, so that a result that is up to date can be described without work
     checks    check name → (passed, words)
+    told      what MLflow is to hear of it, once it is in the store
     """
 
     summary: Mapping[str, Any]
     checks: Mapping[str, tuple[bool, str]] = field(default_factory=dict)
+    told: Sequence["Message"] = ()
 
 
 class Progress:
@@ -97,7 +103,7 @@ class Workbench:
             self.store.register(key, experiment.model_dump(mode="json"))
         experiment.require_sets(budget.observations)
         plan = Plan(self.store, key, experiment, self.variants, (), tuple(budget.observations), look_at_source)
-        return Bench(self, plan, self.progress or Progress(context.log.info))
+        return Bench(self, plan, self.progress or Progress(context.log.info), context.log.warning)
 
 
 def from_base(workbench: Workbench, key: str, fallback: Experiment) -> Experiment:
@@ -116,6 +122,7 @@ class Bench:
     workbench: Workbench
     plan: Plan
     progress: Callable[[str, int, int, str], None]
+    warn: Say
 
     @property
     def store(self) -> Store:
@@ -156,6 +163,19 @@ class Bench:
         made = self.store.made(self.plan.folder(unit))
         return made.summary if made else {}
 
+    @cached_property
+    def outbox(self) -> "Outbox":
+        from pipeline.sinks.mlflow_outbox import Outbox
+
+        return Outbox(self.store, self.workbench.config.tracking.mlflow)
+
+    def run_card(self, variant: Variant, observations: str) -> "RunCard":
+        """The MLflow run of one of our policies: that of its weights, to which everything about it is added."""
+        from pipeline.sinks.to_mlflow import run_card
+
+        trained = self.plan.fingerprint(Unit(f"{variant.name}/trained_policy", observations))
+        return run_card(self.task(variant, observations), self.plan.key, trained)
+
     def make(self, unit: Unit, work: Callable[[Path], Outcome], fingerprint: Callable[[Outcome], str] | None = None):
         """Make one result unless it is up to date; returns what made it.
 
@@ -184,8 +204,28 @@ class Bench:
                 summary,
             )
             self.store.write_made(draft, made)
+            for message in outcome.told:
+                self.outbox.post(message, folder, "/".join(filter(None, (unit.asset, unit.entry))), made.fingerprint)
         self.plan.forget()
-        return made
+        return self._tell_mlflow(folder, made) if outcome.told else made
+
+    def _tell_mlflow(self, folder: Path, made: Made) -> Made:
+        """Send what is kept for MLflow; returns the result, which knows its run then."""
+        delivery = self.outbox.deliver(patient=False)
+        if delivery.kept:
+            self.warn(
+                f"MLflow at {self.outbox.address} cannot be told now ({delivery.why}): {delivery.kept} messages are kept in "
+                f"{self.outbox.folder}."
+            )
+        return self.store.made(folder) or made
+
+
+def mlflow_links(made: Mapping[str, Made]) -> dict[str, dg.MetadataValue]:
+    """The id of the MLflow run of every entry."""
+    return {
+        f"mlflow_{entry}": dg.MetadataValue.text(m.summary.get("mlflow_run_id") or "not sent yet")
+        for entry, m in made.items()
+    }
 
 
 def result(

@@ -3,6 +3,7 @@
     results/
       dagster/                      the Dagster instance (DAGSTER_HOME)
       mlflow.db  mlartifacts/       the MLflow store, when it is a file
+      mlflow_unsent/                what MLflow has not been told yet
       datasets/<key>/               one folder for each data set × settings ("partition")
         experiment.json             source and settings, as registered
         demonstrations/ episode_split/ windows/ multimodality_floor/ benchmark_table/ …
@@ -17,7 +18,7 @@ import shutil
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,14 @@ class Store:
     @staticmethod
     def write_made(draft: Path, made: Made) -> None:
         (draft / MADE).write_text(json.dumps(asdict(made), indent=1, sort_keys=True), encoding="utf-8")
+
+    def amend(self, folder: Path, fingerprint: str, **summary: Any) -> None:
+        """Add to what a result says about itself, if it is still the one of that fingerprint."""
+        made = self.made(folder)
+        if made is not None and made.fingerprint == fingerprint:
+            with drafted(folder / MADE) as draft:
+                added = replace(made, summary={**made.summary, **summary})
+                draft.write_text(json.dumps(asdict(added), indent=1, sort_keys=True), encoding="utf-8")
 
     @staticmethod
     def _replace(draft: Path, folder: Path) -> None:

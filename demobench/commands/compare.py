@@ -67,7 +67,7 @@ class Entry:
     steps: int | None
     budget: str | None
     fingerprint: str
-    mlflow_run_id: str
+    mlflow_run_id: str | None
     seen: bool | None = False
 
     @property
@@ -231,16 +231,16 @@ def _load(plan: "Plan", variant: Variant, observations: str) -> Entry:
         steps=None if elsewhere else trained.get("steps") or plan.experiment.steps,
         budget=None if elsewhere else plan.experiment.budget_of(variant),
         fingerprint=plan.fingerprint(predictions),
-        mlflow_run_id=(trained or made(predictions).summary)["mlflow_run_id"],
+        mlflow_run_id=(trained or made(predictions).summary).get("mlflow_run_id"),
         seen=made(predictions).summary["seen_in_training"] if elsewhere else False,
     )
 
 
 def _check_pin(address: Address, entry: Entry) -> None:
-    if not any(name.startswith(address.pin) for name in (entry.fingerprint, entry.mlflow_run_id)):
+    if not any(name.startswith(address.pin) for name in (entry.fingerprint, entry.mlflow_run_id or "")):
         raise StoreError(
             f"The store no longer holds '{address.text}'. What it holds of {entry.address} is the result "
-            f"{entry.fingerprint} (MLflow run {entry.mlflow_run_id})."
+            f"{entry.fingerprint} (MLflow run {entry.mlflow_run_id or 'not sent yet'})."
         )
 
 
@@ -424,7 +424,8 @@ def _footnotes(verdicts: Sequence["Comparison"], family: int, entries: Sequence[
         )
     if len(entries) <= 4:
         lines += [
-            f"{e.address}@{e.fingerprint}  MLflow run {e.mlflow_run_id}{', predicted elsewhere' if e.is_elsewhere else ''}"
+            f"{e.address}@{e.fingerprint}  MLflow run {e.mlflow_run_id or 'not sent yet'}"
+            f"{', predicted elsewhere' if e.is_elsewhere else ''}"
             for e in entries
         ]
     return lines

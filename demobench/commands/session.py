@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.markup import escape
 
 from pipeline.config import Config, find_config, load_config
 from pipeline.errors import StoreError
@@ -53,6 +54,24 @@ def write_json_to(target: str | None, value: Any) -> None:
             write_json(Path(target), value)
         except OSError as error:
             raise StoreError(f"The JSON cannot be written to {target}: {error.strerror}.") from None
+
+
+def tell_mlflow(session: Session, *, first: bool = False) -> None:
+    """Send MLflow what is kept for it, and say in one line what came of that; `first`, before a run, only what was sent."""
+    from pipeline.sinks.mlflow_outbox import Outbox
+
+    outbox = Outbox(session.store, session.config.tracking.mlflow)
+    delivery = outbox.deliver()
+    if delivery.sent:
+        session.console.print(
+            f"MLflow at {outbox.address} was told what was kept for it: {delivery.sent} results.", soft_wrap=True
+        )
+    if delivery.kept and not first:
+        session.console.print(
+            f"[yellow]MLflow at {outbox.address} cannot be told now ({escape(delivery.why)}): {delivery.kept} results are kept in "
+            f"{short(str(outbox.folder))}, and sent by the next demobench run or demobench ui.[/]",
+            soft_wrap=True,
+        )
 
 
 def open_dataset(argument: str, session: Session, choices: Choices | None = None) -> tuple[Target, Any, Any]:

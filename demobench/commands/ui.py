@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from demobench.commands.session import Session, open_session
+from demobench.commands.session import Session, open_session, tell_mlflow
 from pipeline.errors import DemobenchError
 from pipeline.sinks.to_mlflow import tracking_uri
 
@@ -34,6 +34,7 @@ def serve(port: int, mlflow_port: int, config_path: Path | None, store_path: str
     # Set before the servers start: a signal that a shell told us to ignore would be ignored by them too.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    tell_mlflow(session)
     with tempfile.TemporaryDirectory(prefix="demobench-") as scratch:
         processes = {"Dagster": _dagster(session, port, Path(scratch), config_path)}
         if sqlite:

@@ -1,5 +1,6 @@
 """A tiny benchmark that runs the whole graph in seconds: six short episodes, two seeds, a handful of steps."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,14 +50,18 @@ class TinyBenchmark:
             self.config, config_dir=self.folder, store=self.store, experiments={target.key: target.experiment}
         )
 
-    def run(self, **choices) -> tuple[list[str], dg.DagsterRun]:
+    def run(
+        self, on_event: Callable[[dg.DagsterEvent], None] | None = None, **choices
+    ) -> tuple[list[str], dg.DagsterRun]:
         """Make what is stale; returns the assets that were stale and the run."""
         target, stale = self.target(**choices), self.plan(**choices).stale()
         self.store.register(target.key, target.experiment.model_dump(mode="json"))
         assets = asset_keys(stale)
         with open_instance(self.store.root) as instance:
             selected = [v.name for v in target.selected]
-            run = run_benchmark(instance, self.defs(**choices), target.key, assets, target.observations, selected)
+            run = run_benchmark(
+                instance, self.defs(**choices), target.key, assets, target.observations, selected, on_event
+            )
             assert run.is_success, why_failed(instance, run)
         return [a.to_user_string() for a in assets], run
 

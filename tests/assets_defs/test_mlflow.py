@@ -8,10 +8,12 @@ import mlflow
 import numpy as np
 import pytest
 
+from assets_defs.benchmark import crown
 from assets_defs.plan import Unit
+from assets_defs.resources import Bench, Workbench
 from pipeline.lerobot_format.saved import load_demonstrations
 from pipeline.predict import load_predictions
-from pipeline.sinks.to_mlflow import find_run, tracking_uri
+from pipeline.sinks.to_mlflow import tracking_uri
 
 FRESH = """
 import json, sys
@@ -89,18 +91,31 @@ def test_a_model_holds_no_pickle(finished):
     assert not [p for p in files if p.suffix in (".pkl", ".pickle", ".pt", ".pth")]
 
 
-def test_a_run_that_is_gone_is_opened_again(finished, tmp_path):
-    from pipeline.folds import PolicyTask
-    from pipeline.lerobot_format.quality import resolve_semantics
-    from pipeline.split import load_split
+def test_a_run_says_which_demonstrations_it_is_of(finished, run_of):
+    demos = load_demonstrations(finished.plan().folder(Unit("demonstrations")) / "frames")
+    (used,) = run_of("mlp_k04").inputs.dataset_inputs
+    assert (used.dataset.name, used.dataset.digest) == (demos.name, demos.content_hash[:36])
+    assert mlflow.data.get_source(used.dataset).uri == str(finished.folder)
+    assert json.loads(used.dataset.profile)["episodes"] == demos.episodes
 
-    plan = finished.plan()
-    demos = load_demonstrations(plan.folder(Unit("demonstrations")) / "frames")
-    variant = next(v for v in plan.variants if v.name == "mlp_k04")
-    split = load_split(plan.folder(Unit("episode_split")) / "split.json")
-    sets = plan.experiment.observation_sets
-    task = PolicyTask(demos, resolve_semantics(demos), split, sets[0], variant, plan.experiment)
-    uri = f"sqlite:///{tmp_path / 'mlflow.db'}"
-    opened = find_run(uri, "0" * 32, experiment="tiny", task=task, tags={"fingerprint": "f"})
-    again = find_run(uri, "0" * 32, experiment="tiny", task=task, tags={"fingerprint": "f"})
-    assert opened == again != "0" * 32
+
+def test_the_champions_model_has_the_alias(finished, client, run_of):
+    bench = Bench(Workbench(finished.config, finished.folder, finished.store, ()), finished.plan(), None, None)
+
+    def holder(champion: str) -> str:
+        for message in crown(bench, champion):
+            bench.outbox.post(message, bench.plan.folder(Unit("benchmark_table")), "benchmark_table", "")
+        assert bench.outbox.deliver().kept == 0
+        return client.get_model_version_by_alias("tiny", "champion").run_id
+
+    first = holder("mlp_k04/state")
+    assert first == run_of("mlp_k04").info.run_id
+    assert holder("mlp_k01") == run_of("mlp_k01").info.run_id
+    assert holder("mlp_k04") == first
+    assert holder("hold_still") == first, "a baseline has no model"
+    assert holder("nobody") == first
+    assert len(client.search_model_versions("name = 'tiny'")) == 2
+
+
+def test_nothing_is_kept_where_mlflow_answers(finished):
+    assert not list((finished.store.root / "mlflow_unsent").glob("*.json"))
