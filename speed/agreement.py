@@ -109,7 +109,7 @@ def resampled(
 
 
 def study(methods: int, effects: tuple[float, float, float], ties: bool, sets: int) -> dict[str, float]:
-    """Shares of sets: `interval` → the truth was held; `above zero`, and `within`, `p` of what is within methods."""
+    """Shares of sets: `interval` → the truth was held; `above zero`, and `within a method` and `p ≤ 0.05` there."""
     between, within, share = effects
     setting = {"share": share, "ties": ties}
     overall, inside = truths(SIZES[methods], between, within, **setting)
@@ -125,32 +125,39 @@ def study(methods: int, effects: tuple[float, float, float], ties: bool, sets: i
         if (one := correlate_within(error, outcome, method, policy, permutations=399)) is None:
             continue
         if one.interval is not None:
-            found["within methods"].append(one.interval[0] <= inside <= one.interval[1])
+            found["within a method"].append(one.interval[0] <= inside <= one.interval[1])
         if one.p is not None:
-            found["p at most 0.05"].append(one.p <= 0.05)
+            found["p ≤ 0.05"].append(one.p <= 0.05)
     return {name: float(np.mean(values)) for name, values in found.items() if len(values) >= sets / 4}
 
 
+COLUMNS = (
+    "percentile bootstrap", "bootstrap-t", "t with the bootstrap's standard error", "t with the jackknife's (used)",
+    "surely above zero where nothing predicts", "surely above zero at 0.5", "within a method", "p ≤ 0.05 where nothing predicts",
+)  # fmt: skip
+
+
 def main() -> None:
-    sets = int(sys.argv[1]) if len(sys.argv) > 1 else 300
-    spans: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    """A row for each number of methods: lowest and highest share over the settings."""
+    sets = int(sys.argv[1]) if len(sys.argv) > 1 else 200
+    print(
+        f"{sets} sets a setting; % of them\n\n| methods | "
+        + " | ".join(COLUMNS)
+        + " |"
+        + "\n|---"
+        + "|---" * len(COLUMNS)
+        + "|"
+    )
     for methods in SIZES:
+        found = defaultdict(list)
         for ties in (False, True):
             for effects in EFFECTS:
                 for name, share in study(methods, effects, ties, sets).items():
-                    null = name in ("surely above zero", "p at most 0.05")
-                    kind = f"{name}, {'nothing predicts' if effects[1] == 0 else effects}" if null else name
-                    spans[kind][methods].append(share)
-        print(f"{methods} methods done", file=sys.stderr, flush=True)
-    print(
-        f"Shares of {sets} sets, lowest and highest over settings\n\n| | "
-        + " | ".join(f"{m} methods" for m in SIZES)
-        + " |"
-    )
-    print("|---" * (len(SIZES) + 1) + "|")
-    for name, of in spans.items():
-        cells = (f"{100 * min(of[m]):.1f}–{100 * max(of[m]):.1f} %" if of[m] else "–" for m in SIZES)
-        print(f"| {name} | " + " | ".join(cells) + " |")
+                    found[name].append(share)
+                    found[f"{name} where nothing predicts"] += [share] if effects[0] == 0 else []
+                    found[f"{name} at 0.5"] += [share] if effects[0] == 0.7 else []
+        spans = (f"{100 * min(found[c]):.0f}–{100 * max(found[c]):.0f}" if found[c] else "–" for c in COLUMNS)
+        print(f"| {methods} | " + " | ".join(spans) + " |", flush=True)
 
 
 if __name__ == "__main__":
