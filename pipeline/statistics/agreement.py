@@ -12,7 +12,7 @@ can be taken within methods by taking their means off, and noise lowers it by a 
 Checkpoints of one method are alike, so methods are what is drawn: intervals are Student's t on Fisher's z with a standard error
 by leaving out one method after another (jackknife; Efron & Tibshirani 1993, ch. 11), G − 1 degrees of freedom, and no smaller
 than that of as many independent checkpoints, 1/√(n − 3). Resampling methods (percentile) or studentising that (bootstrap-t)
-covered too little with 5 to 12 methods; docs/proxy.md has the numbers.
+covered too little with 5 to 8 methods; docs/proxy.md has the numbers.
 """
 
 import math
