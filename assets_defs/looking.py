@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import dagster as dg
 
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
-from assets_defs.plan import Unit
+from assets_defs.floor import ESTIMATES
+from assets_defs.floor import KEY as FLOOR_KEY
+from assets_defs.plan import Plan, Unit
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import table
 
@@ -22,11 +24,13 @@ RERUN = dg.AssetKey(["rerun_recording"])
 VIDEO = dg.AssetKey(["rollout_video"])
 EPISODES = 10
 """How many held-out episodes a recording shows."""
+CAMERA_BYTES = 16_000_000
+"""What cameras may take of a Rerun recording, so that it stays below 20 MB."""
 
 
 def looking_assets(deps: Sequence[dg.AssetKey], rollouts: Sequence[dg.AssetKey]) -> list[dg.AssetsDefinition]:
     """Both recordings and the videos; `deps` are the predictions of every policy, `rollouts` its roll-outs."""
-    return [_rollout_video(rollouts), _mcap_log([*deps, VIDEO]), _rerun_recording([*deps, VIDEO])]
+    return [_rollout_video(rollouts), _mcap_log([*deps, VIDEO]), _rerun_recording([*deps, VIDEO, FLOOR_KEY])]
 
 
 def _held_out(bench: Bench) -> list[int]:
@@ -226,7 +230,12 @@ def _rerun_recording(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
     def rerun_recording(
         context: dg.AssetExecutionContext, workbench: dg.ResourceParam[Workbench], budget: Budget
     ) -> dg.MaterializeResult:
-        """Held-out episodes in Rerun: joints recorded against predicted, and the error over time; roll-outs beside them."""
+        """Held-out episodes in Rerun: joints recorded against predicted, and the error over time above its floor, if known.
+
+        Beside them what there is to see: the cameras, the SO-101 by its own meshes, PushT's table, the chunk predicted just now;
+        roll-outs in tabs of their own. Diamonds mark where a policy disagrees most with the recording. Cameras take the data
+        set's own bytes, of as many episodes as keep the file small; `demobench view` shows the others.
+        """
         bench = workbench.open(context, budget)
         unit = Unit("rerun_recording")
         made = bench.make(unit, lambda draft: _write_rerun(bench, draft))
@@ -236,6 +245,7 @@ def _rerun_recording(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
             "open_with": f"rerun --bind 127.0.0.1 {path}",
             "episodes": dg.MetadataValue.json(made.summary["episodes"]),
             "size_mb": made.summary["size_mb"],
+            "cameras left out": table(["why"], [(why,) for why in made.summary["left_out"]]),
         }
         return result(bench, RERUN, {"": made}, metadata, ["holds_every_episode"])
 
@@ -247,14 +257,32 @@ def _write_rerun(bench: Bench, draft) -> Outcome:
 
     path = draft / "held_out.rrd"
     episodes = _held_out(bench)
-    shown, predictions = _driven(bench), _predictions(bench)
-    write_rerun(path, bench.demonstrations, bench.semantics, predictions, episodes, name=bench.plan.key, driven=shown)
+    left_out = write_rerun(
+        path,
+        bench.demonstrations,
+        bench.semantics,
+        _predictions(bench),
+        episodes,
+        name=bench.plan.key,
+        driven=_driven(bench),
+        floors=mean_error_floors(bench.plan),
+        camera_bytes=CAMERA_BYTES,
+    )
     ids = _recorded_ids(bench, episodes)
     found = episodes_in(path)
     return Outcome(
-        {"episodes": ids, "size_mb": round(path.stat().st_size / 1e6, 2)},
+        {"episodes": ids, "size_mb": round(path.stat().st_size / 1e6, 2), "left_out": left_out},
         {"holds_every_episode": (found == set(ids), f"{len(found)} of {len(ids)} episodes")},
     )
+
+
+def mean_error_floors(plan: Plan) -> dict[str, float]:
+    """Observation set → where the floor of the first action's mean error lies, at the least; those that are known."""
+    from pipeline.statistics.floors import load_estimates
+
+    path = plan.folder(Unit("multimodality_floor")) / ESTIMATES
+    found = load_estimates(path) if path.is_file() else []
+    return {e.observations: e.value for e in found if e.loss == "mae" and e.horizon == 0 and e.value is not None}
 
 
 def _driven(bench: Bench) -> list["Driven"]:

@@ -35,7 +35,7 @@ CODE_VERSIONS = {
     "benchmark_report": "9",
     "rollout_video": "1",
     "mcap_log": "2",
-    "rerun_recording": "2",
+    "rerun_recording": "3",
 }
 """Raised by hand when what an asset computes changes: everything downstream becomes stale."""
 
@@ -247,7 +247,7 @@ class Plan:
                 shown = {
                     "benchmark_report": [Unit("benchmark_table"), Unit("rollout_video"), *self.curves()],
                     "mcap_log": [Unit("rollout_video")],
-                    "rerun_recording": [Unit("rollout_video")],
+                    "rerun_recording": [Unit("rollout_video"), Unit("multimodality_floor")],
                 }
                 return [*shown.get(unit.kind, []), *policies]
 

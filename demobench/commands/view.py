@@ -24,6 +24,7 @@ def view_episode(
     """One episode with what every up-to-date policy predicted in it (held-out episodes have predictions)."""
     import numpy as np
 
+    from assets_defs.looking import mean_error_floors
     from assets_defs.plan import Plan, Unit
     from pipeline.predict import load_predictions
     from pipeline.sinks import to_rerun
@@ -61,7 +62,10 @@ def view_episode(
         session.console.print(_why_no_predictions(episode, predictions, demos, target, session), soft_wrap=True)
     path = save or session.store.dataset(target.key) / "view.rrd"
     path.parent.mkdir(parents=True, exist_ok=True)
-    to_rerun.write_rerun(path, demos, semantics, predictions, [int(position[0])], name=f"{target.key} {episode}")
+    floors = mean_error_floors(plan) if plan.is_fresh(Unit("multimodality_floor")) else {}
+    shown, name = [int(position[0])], f"{target.key} {episode}"
+    for why in to_rerun.write_rerun(path, demos, semantics, predictions, shown, name=name, floors=floors):
+        session.console.print(f"Left out: {why}", soft_wrap=True)
     if save:
         session.console.print(f"Written to {save}. Open it with: rerun --bind 127.0.0.1 {save}", soft_wrap=True)
     elif to_rerun.view(path).returncode:

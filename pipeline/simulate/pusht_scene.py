@@ -18,13 +18,19 @@ PLAN_PX, WAY_PX = 5.0, 2.0
 def shapes(scenes: Scenes, row: int) -> list[Shape]:
     """The goal's outline, the block, the finger, its way, and where it is told to go."""
     finger, block = frames_of(scenes, row, STATE), frames_of(scenes, row, BLOCK)
+    goal, pushed = things(block)
     return [
-        Shape("goal", "target", _outline(GOAL)),
+        goal,
         Shape("way", "way", finger[None, None], WAY_PX),
-        Shape("block", "object", _outline(block)),
+        pushed,
         Shape("finger", "robot", _disc(finger)),
         Shape("predicted_chunk", "plan", plan_ahead(scenes, row, finger, lambda actions: actions), PLAN_PX),
     ]
+
+
+def things(block: np.ndarray) -> list[Shape]:
+    """The goal and the block, from the columns of `BLOCK` [n, 3]."""
+    return [Shape("goal", "target", _outline(GOAL)), Shape("block", "object", _outline(block))]
 
 
 def _outline(poses: np.ndarray) -> np.ndarray:

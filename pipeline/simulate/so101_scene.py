@@ -68,15 +68,27 @@ def shapes(scenes: Scenes, row: int) -> list[Shape]:
     state, pose = frames_of(scenes, row, STATE), frames_of(scenes, row, POSE)
     points = arm.lines(to_angles(state))
     tips = points[:, -1]
+    target, cube = things(pose)
     return [
-        Shape("table", "ground", _flat([(-0.05, -0.23), (0.31, -0.23), (0.31, 0.23), (-0.05, 0.23)])),
-        Shape("target", "target", _disc(pose[0, 5:7], PLACED_M) + np.array([0.0, 0.0, ABOVE_M])),
+        TABLE,
+        target,
         Shape("way", "way", tips[None, None], WAY_M),
-        Shape("cube", "object", _cube(pose)),
+        cube,
         Shape("arm", "robot", points[:, _pairs(0, 1, 2, 3, 4, 5)], LINK_M),
         Shape("jaws", "robot", points[:, [*_pairs(5, 7, 8), *_pairs(5, 6, 9)]], JAW_M),
         Shape("predicted_chunk", "plan", plan_ahead(scenes, row, tips, arm.tip), PLAN_M),
     ]
+
+
+def things(pose: np.ndarray) -> list[Shape]:
+    """The target and the cube, from the columns of `POSE` [n, 7]."""
+    target = _disc(pose[0, 5:7], PLACED_M) + np.array([0.0, 0.0, ABOVE_M])
+    return [Shape("target", "target", target), Shape("cube", "object", _cube(pose))]
+
+
+def fingertips(columns: np.ndarray) -> np.ndarray:
+    """Columns [.., 6] → the middle between the fingertips [.., 3] m, NaN where the columns are."""
+    return _Arm(model()).tip(columns)
 
 
 def _pairs(*places: int) -> list[list[int]]:
@@ -102,4 +114,5 @@ def _cube(pose: np.ndarray) -> np.ndarray:
     return (pose[:, None, :3] + turned)[:, FACES]
 
 
+TABLE = Shape("table", "ground", _flat([(-0.05, -0.23), (0.31, -0.23), (0.31, 0.23), (-0.05, 0.23)]))
 DRAWING = Drawing(Camera((0.82, -0.42, 0.52), (0.15, 0.0, 0.078), 29.5), 4 / 3, FPS, "placed", shapes)

@@ -63,7 +63,7 @@ def send_rollouts(recording: Any, driven: Driven) -> None:
         if isinstance(driven.drawing.view, Camera):
             recording.log(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for shape in driven.drawing.shapes(driven.scenes, row):
-            _send_shape(recording, f"{root}/{shape.name}", shape, fps)
+            send_shape(recording, f"{root}/{shape.name}", shape, np.arange(len(shape.points)) / fps)
     _send_video(recording, f"{driven.root()}/video", driven)
 
 
@@ -95,14 +95,14 @@ def _view(driven: Driven, row: int) -> Any:
     )
 
 
-def _send_shape(recording: Any, entity: str, shape: Shape, fps: float) -> None:
-    """Looks once, places for every frame; polygons of the plane by their outline."""
+def send_shape(recording: Any, entity: str, shape: Shape, seconds: np.ndarray) -> None:
+    """Looks once, places at the time of every frame; polygons of the plane by their outline."""
     import rerun as rr
 
     count, dimensions = len(shape.points), shape.points.shape[-1]
     still = count == 1
     colour = [bytes.fromhex(ROLES[shape.role].dark[1:])[channel] for channel in range(3)]
-    times = [rr.TimeColumn(TIME, duration=np.arange(count) / fps), rr.TimeColumn(FRAME, sequence=np.arange(count))]
+    times = [rr.TimeColumn(TIME, duration=seconds), rr.TimeColumn(FRAME, sequence=np.arange(count))]
     if not shape.width and dimensions == 3:
         recording.log(entity, _mesh_looks(shape, colour), static=True)
         places = shape.points.reshape(count, -1, 3)

@@ -2,7 +2,11 @@
 
     /episode_007/joints/<column>          [frames, series] the state, the recorded action, each policy's first action
     /episode_007/error                    [frames, policies] mean |first action − recorded action| over the columns
+    /episode_007/error/floor              where the floor lies that no deterministic policy's mean error is below, if known
+    /episode_007/error/disagrees          [frames, policies] the error again, where it is among the policy's largest
+    /episode_007/camera/<camera>          the picture of each frame (`rerun_cameras`)
     /episode_007/path/…                   positions in a plane only: where it went, and the chunk predicted just now
+    /episode_007/scene/…                  an arm that is known (`rerun_scenes`)
     /rollouts/…                           roll-outs (`rerun_rollouts`)
 
 What belongs here: entities, their looks, the blueprint, the viewer. What does not: choosing episodes, scores.
@@ -13,9 +17,10 @@ shown by their first seed, at the frames at which they were asked; elsewhere a s
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,15 +29,20 @@ import numpy as np
 
 from pipeline.errors import StoreError
 from pipeline.normalize import wrap
+from pipeline.simulate.recorded import Arm, arm_of
 from pipeline.sinks import replacing
 from pipeline.sinks.palette import BASELINES, INK, MUTED, is_baseline, policy_colours
+from pipeline.sinks.rerun_cameras import Cameras, camera_entity
 from pipeline.sinks.rerun_rollouts import FRAME, TIME, Driven, rollouts_tab, send_rollouts
+from pipeline.sinks.rerun_scenes import arm_view, send_arm, send_things
 from pipeline.sinks.words import common_unit
 from pipeline.types import ACTION, STATE, Demonstrations, Predictions, Semantics
 
 EPISODE = "episode_"
 VIEWER = "rerun_cli"
 HIDDEN_AT_FIRST = ("constant_velocity", "mean_action")
+DISAGREES = 0.05
+"""The share of a policy's answers, those with the largest errors, that are marked: there it disagrees with the recording."""
 Rgb = tuple[int, int, int]
 
 
@@ -55,7 +65,9 @@ def write_rerun(
     *,
     name: str,
     driven: Sequence[Driven] = (),
-) -> None:
+    floors: Mapping[str, float] | None = None,
+    camera_bytes: int | None = None,
+) -> list[str]:
     """Write one `.rrd` file that opens with its own layout: a tab an episode, and one for the roll-outs of each policy shown.
 
     Parameters:
@@ -63,6 +75,10 @@ def write_rerun(
         episodes: positions of the episodes to show, in this order.
         name: what the viewer calls the recording.
         driven: roll-outs to show.
+        floors: observation set → the floor of the mean error of the first action.
+        camera_bytes: what cameras may take together; None is no limit.
+
+    Returns: why pictures of cameras are missing, if they are.
 
     Raises:
         StoreError: the file cannot be written.
@@ -70,21 +86,29 @@ def write_rerun(
     import rerun as rr
 
     lines = [*_recorded_series(), *_policy_series(predictions)]
+    looks, arm, cameras = lines[2:], arm_of(demos), Cameras(demos, camera_bytes)
+    largest = _largest(demos, semantics, predictions)
     recording = rr.RecordingStream("demobench")
     with replacing(path) as temporary:
         temporary.touch()  # Rerun's own message about a folder that cannot be written names neither cause nor remedy
-        recording.save(temporary, default_blueprint=_blueprint(demos, semantics, episodes, driven))
+        recording.save(temporary)
         recording.send_recording_name(name)
         recording.send_property("demobench", rr.AnyValues(**_properties(demos, semantics)))
         for episode in episodes:
+            root, frames = episode_root(demos, episode), demos.episode(episode)
             _send_joints(recording, demos, semantics, predictions, episode, lines)
-            _send_error(recording, demos, semantics, predictions, episode, lines[2:])
+            _send_error(recording, demos, semantics, predictions, episode, looks, floors or {}, largest)
+            cameras.send(recording, root, episode, partial(_first_times, demos, frames))
             if has_paths(demos, semantics):
-                _send_paths(recording, demos, semantics, predictions, episode, lines[2:])
+                _send_paths(recording, demos, semantics, predictions, episode, looks)
+            if arm:
+                send_arm(recording, f"{root}/scene", demos, episode, arm, predictions, [s.colour for s in looks])
         for one in driven:
             send_rollouts(recording, one)
+        recording.send_blueprint(_blueprint(demos, semantics, episodes, driven, cameras, arm))
         recording.flush()
         recording.disconnect()
+    return cameras.left_out
 
 
 def episodes_in(path: Path) -> set[int]:
@@ -178,6 +202,10 @@ def _times(demos: Demonstrations, frames: slice, places: np.ndarray | slice = sl
     ]
 
 
+def _first_times(demos: Demonstrations, frames: slice, count: int) -> list[Any]:
+    return _times(demos, frames, slice(count))
+
+
 def _first_actions(one: Predictions, frames: slice, columns: int) -> np.ndarray:
     """[n, A] the first action predicted at every frame of an episode; NaN where the policy was not asked."""
     actions = np.full((frames.stop - frames.start, columns), np.nan)
@@ -217,19 +245,51 @@ def _send_joints(recording, demos, semantics, predictions, episode, series) -> N
         _send_series(recording, entity, _times(demos, frames), shown, np.stack(values, axis=1))
 
 
-def _send_error(recording, demos, semantics, predictions, episode, series) -> None:
+def _errors(demos: Demonstrations, semantics: Semantics, one: Predictions) -> np.ndarray:
+    """[M] mean |first action − recorded action| over the columns, at every anchor."""
+    recorded = demos.columns[ACTION][one.anchors]
+    error = one.actions[0, :, 0, :] - recorded
+    circular = np.array(semantics.circular.get(ACTION, (False,) * recorded.shape[1]))
+    error[:, circular] = wrap(error[:, circular])
+    return np.abs(error).mean(axis=1)
+
+
+def _largest(demos: Demonstrations, semantics: Semantics, predictions: Sequence[Predictions]) -> list[float]:
+    """The error from which on each policy is said to disagree: over all that it was asked, not one episode."""
+    return [
+        float(np.quantile(_errors(demos, semantics, one), 1 - DISAGREES)) if len(one.anchors) else np.inf
+        for one in predictions
+    ]
+
+
+def _send_error(recording, demos, semantics, predictions, episode, series, floors, largest) -> None:
+    import rerun as rr
+
     if not predictions:
         return
     frames = demos.episode(episode)
-    action = demos.columns[ACTION][frames]
-    circular = np.array(semantics.circular.get(ACTION, (False,) * action.shape[1]))
-    errors = []
-    for one in predictions:
-        error = _first_actions(one, frames, action.shape[1]) - action
-        error[:, circular] = wrap(error[:, circular])
-        errors.append(np.abs(error).mean(axis=1))
+    errors = np.full((frames.stop - frames.start, len(predictions)), np.nan)
+    for place, one in enumerate(predictions):
+        inside = one.in_frames(frames)
+        errors[one.anchors[inside] - frames.start, place] = _errors(demos, semantics, one)[inside]
     entity = f"{episode_root(demos, episode)}/error"
-    _send_series(recording, entity, _times(demos, frames), series, np.stack(errors, axis=1))
+    _send_series(recording, entity, _times(demos, frames), series, errors)
+    learned = [p for p, one in enumerate(predictions) if not is_baseline(one.policy)]
+    marked = np.where(errors >= np.array(largest), errors, np.nan)[:, learned]
+    if np.isfinite(marked).any():
+        looks = rr.SeriesPoints(
+            names=[f"{series[p].name}: its largest {DISAGREES:.0%}" for p in learned],
+            colors=[series[p].colour for p in learned],
+            markers=["diamond"] * len(learned),
+            marker_sizes=[4.0] * len(learned),
+        )
+        recording.log(f"{entity}/disagrees", looks, static=True)
+        recording.send_columns(f"{entity}/disagrees", _times(demos, frames), rr.Scalars.columns(scalars=marked))
+    if floors:
+        lines = [Series(f"floor ({name})", INK.rgb_on_dark, 2.0) for name in floors]
+        ends = np.array([0, frames.stop - frames.start - 1])
+        values = np.tile(list(floors.values()), (2, 1))
+        _send_series(recording, f"{entity}/floor", _times(demos, frames, ends), lines, values)
 
 
 def _send_paths(recording, demos, semantics, predictions, episode, series) -> None:
@@ -239,6 +299,7 @@ def _send_paths(recording, demos, semantics, predictions, episode, series) -> No
     frames = demos.episode(episode)
     root = f"{episode_root(demos, episode)}/path"
     state = demos.columns[STATE][frames][:, list(semantics.state_column)]
+    send_things(recording, root, demos, episode)
     recording.log(f"{root}/recorded", rr.LineStrips2D([state], colors=[MUTED.rgb_on_dark], draw_order=0), static=True)
     dot = rr.Points2D.columns(positions=state, colors=[INK.rgb_on_dark] * len(state), radii=np.full(len(state), -4.0))
     recording.send_columns(f"{root}/state", _times(demos, frames), dot)
@@ -258,11 +319,13 @@ def _column_names(demos: Demonstrations) -> list[str]:
     return [name if names.count(name) == 1 else f"{name}_{place}" for place, name in enumerate(names)]
 
 
-def _blueprint(demos: Demonstrations, semantics: Semantics, episodes: Sequence[int], driven: Sequence[Driven]) -> Any:
-    """A tab an episode: joints in a grid, the error below them, the path beside them where there is one; then roll-outs."""
+def _blueprint(demos, semantics, episodes: Sequence[int], driven: Sequence[Driven], cameras: Cameras, arm) -> Any:
+    """A tab an episode: joints in a grid, the error below them, what there is to see beside them; then roll-outs."""
     import rerun.blueprint as rrb
 
-    tabs = [_tab(demos, semantics, episode) for episode in episodes] + [rollouts_tab(one) for one in driven]
+    tabs = [_tab(demos, semantics, episode, cameras, arm) for episode in episodes] + [
+        rollouts_tab(one) for one in driven
+    ]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0, name="held-out episodes and roll-outs" if driven else "held-out episodes"),
         rrb.TimePanel(state="collapsed", timeline=TIME),
@@ -271,19 +334,25 @@ def _blueprint(demos: Demonstrations, semantics: Semantics, episodes: Sequence[i
     )
 
 
-def _tab(demos: Demonstrations, semantics: Semantics, episode: int) -> Any:
+def _tab(demos: Demonstrations, semantics: Semantics, episode: int, cameras: Cameras, arm: Arm | None) -> Any:
     import rerun.blueprint as rrb
 
     root = episode_root(demos, episode)
-    plots = [rrb.Grid(*_joint_views(demos, root)), _error_view(demos, root, episode)]
+    plots = rrb.Vertical(rrb.Grid(*_joint_views(demos, root)), _error_view(demos, root, episode), row_shares=[2, 1])
+    seen = [
+        rrb.Spatial2DView(origin=camera_entity(root, camera), name=f"camera {camera.key}")
+        for camera in cameras.shown(episode)
+    ]
+    if has_paths(demos, semantics):
+        hidden = [f"- {root}/path/{policy}/**" for policy in BASELINES]
+        contents = ["+ $origin/**", *hidden]
+        seen.append(rrb.Spatial2DView(origin=f"{root}/path", contents=contents, name="path and predicted chunks"))
+    if arm:
+        seen.append(arm_view(f"{root}/scene", arm))
     title = f"episode {demos.episode_ids[episode]}"
-    if not has_paths(demos, semantics):
-        return rrb.Vertical(*plots, row_shares=[2, 1], name=title)
-    hidden = [f"- {root}/path/{policy}/**" for policy in BASELINES]
-    path = rrb.Spatial2DView(
-        origin=f"{root}/path", contents=["+ $origin/**", *hidden], name="path and predicted chunks"
-    )
-    return rrb.Horizontal(rrb.Vertical(*plots), path, name=title)
+    if not seen:
+        return rrb.Vertical(plots, name=title)
+    return rrb.Horizontal(plots, rrb.Vertical(*seen), column_shares=[3, 2], name=title)
 
 
 def _joint_views(demos: Demonstrations, root: str) -> list[Any]:

@@ -1,24 +1,43 @@
 """Recordings are read back by Rerun's own reader and checked by its own command line."""
 
+import io
+import shutil
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
 from pipeline.errors import StoreError
+from pipeline.lerobot_format.quality import resolve_semantics
+from pipeline.lerobot_format.read import read_dataset
 from pipeline.simulate.so101 import POSE
+from pipeline.simulate.so101_arm import NAMES, PAN_AXIS_X_M, UNITS
 from pipeline.sinks import to_rerun
 from pipeline.sinks.rerun_rollouts import Driven
 from pipeline.sinks.rollout_video import write_video
 from pipeline.sinks.to_rerun import episodes_in, has_paths, view, write_rerun
-from pipeline.types import ACTION, STATE, Scenes
+from pipeline.types import ACTION, STATE, Feature, Scenes
+from tests.filming import (
+    KEY,
+    PATH_V2,
+    WITH_B_FRAMES,
+    WITHOUT,
+    as_png,
+    filmed_v2,
+    filmed_v3,
+    number_of,
+    with_pictures,
+    write_mp4,
+)
+from tests.makers import tiny_recording
 
-from .driving import make_driven
+from .driving import BLOCK, make_driven
 from .making import NASTY, make_demos, make_predictions, make_semantics
 
 
@@ -264,3 +283,123 @@ def test_a_viewer_that_is_not_installed_is_one_clear_message(recording, monkeypa
     monkeypatch.setattr(to_rerun, "VIEWER", "a_viewer_that_nobody_installed")
     with pytest.raises(StoreError, match=r"viewer is not installed here.*pip install rerun-sdk.*held_out\.rrd"):
         view(recording)
+
+
+@pytest.mark.parametrize(("film", "options"), [(filmed_v2, WITHOUT), (filmed_v3, WITH_B_FRAMES), (with_pictures, None)])
+def test_the_camera_at_time_t_shows_the_picture_of_the_frame_at_time_t(tmp_path, film, options):
+    recording = tiny_recording(3, (13, 20, 9))
+    folder = film(tmp_path / "set", recording, *([] if options is None else ["libx264", options]))
+    demos = read_dataset(folder, name="set")
+    demos = replace(demos, timestamps=demos.timestamps * 1.07)  # the data's clock is not the camera's
+    left_out = write_rerun(tmp_path / "a.rrd", demos, resolve_semantics(demos), [], [1, 2], name="a")
+    assert left_out == []
+    entities = read(tmp_path / "a.rrd")
+    for episode, frames in ((1, range(13, 33)), (2, range(33, 42))):
+        chunks = entities[f"/episode_{episode:03d}/camera/{KEY}"]
+        seconds = [t.total_seconds() for t in column(chunks, "time")]
+        np.testing.assert_allclose(seconds, demos.timestamps[demos.episode(episode)], atol=1e-6)
+        if options is None:
+            assert [bytes(blob[0]) for blob in column(chunks, "EncodedImage:blob")] == [as_png(k) for k in frames]
+            continue
+        [mp4] = column([chunk for chunk in chunks if chunk.is_static], "AssetVideo:blob")
+        due = [nanos[0] * 1e-9 for nanos in column(chunks, "VideoFrameReference:timestamp")]
+        with av.open(io.BytesIO(bytes(mp4[0]))) as container:
+            shown = {round(f.time, 3): number_of(f.to_ndarray(format="rgb24")) for f in container.decode(video=0)}
+        assert [shown[round(second, 3)] for second in due] == list(frames)
+
+
+def test_cameras_that_do_not_fit_or_cannot_be_read_are_left_out_and_said_so(tmp_path):
+    folder = filmed_v2(tmp_path / "set", tiny_recording(3, 12))
+    write_mp4(folder / PATH_V2.format(episode_chunk=0, video_key=KEY, episode_index=1), range(5))
+    demos, path = read_dataset(folder, name="set"), tmp_path / "a.rrd"
+    semantics = resolve_semantics(demos)
+    room = (folder / PATH_V2.format(episode_chunk=0, video_key=KEY, episode_index=0)).stat().st_size + 500
+    left_out = write_rerun(path, demos, semantics, [], [0, 1, 2], name="a", camera_bytes=room)
+    assert len(left_out) == 2
+    assert "holds 5 pictures of episode 1, which has 12 frames" in left_out[0]
+    assert "episode 2 would make the recording too large" in left_out[1]
+    assert {entity for entity in read(path) if "/camera/" in entity} == {f"/episode_000/camera/{KEY}"}
+    assert episodes_in(path) == {0, 1, 2}
+    shutil.rmtree(folder / "videos")
+    absent = read_dataset(folder, name="set")
+    (why,) = write_rerun(path, absent, semantics, [], [0, 2], name="a")
+    assert "that meta/ declares are not in" in why
+
+
+def test_the_floor_lies_in_the_error_of_the_whole_episode(tmp_path, demos, semantics, predictions):
+    write_rerun(tmp_path / "a.rrd", demos, semantics, predictions, [1], name="a", floors={"state": 3.25})
+    chunks = read(tmp_path / "a.rrd")["/episode_008/error/floor"]
+    assert column([chunk for chunk in chunks if chunk.is_static], "SeriesLines:names") == [["floor (state)"]]
+    assert column(chunks, "Scalars:scalars") == [[3.25], [3.25]]
+    seconds = [t.total_seconds() for t in column(chunks, "time")]
+    np.testing.assert_allclose(seconds, demos.timestamps[demos.episode(1)][[0, -1]], atol=1e-6)
+
+
+def test_diamonds_mark_the_largest_errors_of_trained_policies_over_all_they_were_asked(tmp_path, demos, semantics):
+    one = make_predictions(demos, [1, 2])
+    actions = one.actions.copy()
+    actions[0, 10:13] += 100.0  # three of 56 answers
+    far = [replace(one, actions=actions), make_predictions(demos, [1, 2], "hold_still", 11, off=20.0)]
+    write_rerun(tmp_path / "a.rrd", demos, semantics, far, [1, 2], name="a")
+    entities = read(tmp_path / "a.rrd")
+    marked = np.array(column(entities["/episode_008/error/disagrees"], "Scalars:scalars"))
+    assert marked.shape == (24, 1)
+    assert np.flatnonzero(np.isfinite(marked[:, 0])).tolist() == [12, 13, 14]
+    np.testing.assert_allclose(marked[12:15, 0], 105, atol=1e-3)
+    assert "/episode_009/error/disagrees" not in entities
+    static = [chunk for chunk in entities["/episode_008/error/disagrees"] if chunk.is_static]
+    assert column(static, "SeriesPoints:names") == [["mlp_k04: its largest 5%"]]
+
+
+def test_an_so101_in_degrees_is_its_own_arm_and_one_in_other_units_is_not(tmp_path):
+    pytest.importorskip("mujoco")
+    demos = make_demos(columns=6, lengths=(20,), fps=30.0)
+    state = np.zeros((20, 6), np.float32)
+    state[:, 0] = np.arange(20)
+    feature = {key: Feature(key, NAMES, UNITS) for key in (STATE, ACTION)}
+    arm = replace(demos, columns={STATE: state, ACTION: state}, features=feature)
+    semantics = make_semantics(arm)
+    chunk = make_predictions(arm, [0], "mlp_k16", 16)
+    write_rerun(tmp_path / "a.rrd", arm, semantics, [chunk], [0], name="a")
+    test_rerun_itself_finds_no_fault(tmp_path / "a.rrd")
+    entities = read(tmp_path / "a.rrd")
+    jaw = entities["/episode_007/scene/arm/gripper"]
+    places = np.array(column([c for c in jaw if not c.is_static], "Transform3D:translation"))[:, 0]
+    radius = np.hypot(places[:, 0] - PAN_AXIS_X_M, places[:, 1])
+    turned = np.degrees(np.arctan2(places[:, 1], places[:, 0] - PAN_AXIS_X_M))
+    np.testing.assert_allclose(radius, radius[0], atol=1e-6)
+    np.testing.assert_allclose(turned - turned[0], -np.arange(20), atol=0.01)
+    strips = column(entities["/episode_007/scene/mlp_k16/state"], "LineStrips3D:strips")
+    assert (len(strips), len(strips[0][0])) == (6, 9)  # ten times a second; from the fingertips through eight actions
+    unknown = {key: Feature(key, NAMES, (None,) * 6) for key in (STATE, ACTION)}
+    write_rerun(tmp_path / "b.rrd", replace(arm, features=unknown), semantics, [], [0], name="b")
+    assert not [entity for entity in read(tmp_path / "b.rrd") if "/scene" in entity]
+
+
+def test_pushts_block_lies_beside_the_path(tmp_path, demos, semantics):
+    names = ("x_px", "y_px")
+    features = {key: replace(f, names=names) for key, f in demos.features.items()}
+    block = np.tile(np.array([100, 200, 0], np.float32), (demos.frames, 1))
+    features[BLOCK] = Feature(BLOCK, ("block_x_px", "block_y_px", "block_angle_rad"), ("px", "px", "rad"))
+    demos = replace(demos, features=features, columns=dict(demos.columns) | {BLOCK: block})
+    write_rerun(tmp_path / "a.rrd", demos, semantics, [], [0], name="a")
+    entities = read(tmp_path / "a.rrd")
+    moved = [chunk for chunk in entities["/episode_007/path/block"] if not chunk.is_static]
+    corners = np.array(column(moved, "LineStrips2D:strips"))
+    assert len(corners) == 30
+    assert [corners[0, 0, :, axis].min() for axis in (0, 1)] == [40, 200]
+    assert "/episode_007/path/goal" in entities
+
+
+@pytest.mark.parametrize("name", ["pusht_image", "cr5_banana"])
+def test_real_recordings_with_their_cameras(tmp_path, shared_data, name):
+    demos = read_dataset(shared_data / name, name=name)
+    assert write_rerun(tmp_path / "a.rrd", demos, resolve_semantics(demos), [], [0, 1], name=name) == []
+    test_rerun_itself_finds_no_fault(tmp_path / "a.rrd")
+    entities = read(tmp_path / "a.rrd")
+    for episode in (0, 1):
+        (chunks,) = [entities[e] for e in entities if e.startswith(f"/episode_{episode:03d}/camera/")]
+        seconds = [t.total_seconds() for t in column(chunks, "time")]
+        np.testing.assert_allclose(seconds, demos.timestamps[demos.episode(episode)], atol=1e-6)
+        due = [nanos[0] for nanos in column(chunks, "VideoFrameReference:timestamp")]
+        assert due == [due[0] + 100_000_000 * k for k in range(len(seconds))], "the camera's clock is even"
