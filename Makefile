@@ -1,6 +1,6 @@
 # make demo    the whole benchmark on the two embedded data sets
 # make test    the tests; make test-slow the long ones
-# make ui      Dagster and MLflow on 127.0.0.1
+# make ui      Dagster, MLflow and the reports on 127.0.0.1
 # make lerobot-env   LeRobot in an environment of its own, for the tests that need it
 
 PYTHON ?= python3

@@ -37,7 +37,7 @@ def curve_assets(predictions: Sequence[dg.AssetKey]) -> list[dg.AssetsDefinition
     @dg.asset(
         key=KEY,
         partitions_def=PARTITIONS,
-        group_name="floor",
+        group_name="benchmark",
         kinds={"pytorch", "numpy", "altair"},
         deps=[episode_split, multimodality_floor, *predictions],
         code_version=code_version("learning_curve"),

@@ -8,8 +8,9 @@ import dagster as dg
 from pydantic import Field
 
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
+from assets_defs.links import mlflow_links
 from assets_defs.plan import SCORED, Plan, Unit
-from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, mlflow_links, result
+from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import picture, present, table
 from pipeline.config import check_slug
 from pipeline.errors import ConfigError, did_you_mean
@@ -109,10 +110,8 @@ def elsewhere_assets() -> list[dg.AssetsDefinition]:
         }
         if config.name:
             made[config.name] = _make(bench, config)
-        if not made:
-            raise ConfigError(
-                "Nothing was scored yet. Name a file of predictions in the launchpad: name and predictions."
-            )
+        # "Materialize all" comes by here too: with nothing to score it must not stop the table that follows.
+        nothing = None if made else "Nothing was scored yet: name a file of predictions in the launchpad."
         rows = [
             (
                 name,
@@ -132,7 +131,7 @@ def elsewhere_assets() -> list[dg.AssetsDefinition]:
             bench,
             KEY,
             made,
-            present({"scores": table(header, rows), **pictures, **mlflow_links(made)}),
+            present({"scores": table(header, rows), "nothing": nothing, **pictures, **mlflow_links(bench, made)}),
             ["aligned", "whole_episodes"],
         )
 

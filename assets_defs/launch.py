@@ -29,9 +29,9 @@ from dagster._core.types.loadable_target_origin import LoadableTargetOrigin
 from assets_defs.automation import BENCHMARK
 from assets_defs.data import PARTITIONS
 from assets_defs.definitions import LOCATION
+from assets_defs.resources import HOST_TAG, PID_TAG
 
 MODULE = "assets_defs.definitions"
-PID_TAG, HOST_TAG = "demobench/pid", "demobench/host"
 
 INSTANCE_SETTINGS = """\
 # Written by demobench; delete it to get the defaults back.

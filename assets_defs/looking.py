@@ -10,6 +10,7 @@ import dagster as dg
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
 from assets_defs.floor import ESTIMATES
 from assets_defs.floor import KEY as FLOOR_KEY
+from assets_defs.links import file_link
 from assets_defs.plan import Plan, Unit
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import table
@@ -69,6 +70,7 @@ def _mcap_log(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
         path = bench.plan.folder(unit) / "held_out.mcap"
         metadata = {
             "file": dg.MetadataValue.path(str(path)),
+            "download": dg.MetadataValue.url(file_link(bench, unit, path.name)),
             "open_with": f"demobench view {bench.plan.key} {made.summary['episodes'][0]}",
             "messages": made.summary["messages"],
             "size_mb": made.summary["size_mb"],
@@ -158,7 +160,11 @@ def _rollout_video(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
         rows += [(observations, why, None, None, None) for observations, why in made.summary["left_out"].items()]
         header = ["observations", "policy", "succeeded", "start states", "kB"]
         files = {v["observations"]: str(bench.plan.folder(unit) / v["file"]) for v in made.summary["videos"]}
-        metadata = {"videos": table(header, rows)} | {f"file_{k}": dg.MetadataValue.path(f) for k, f in files.items()}
+        metadata = {
+            "videos": table(header, rows),
+            **{f"file_{k}": dg.MetadataValue.path(f) for k, f in files.items()},
+            **{f"watch_{k}": dg.MetadataValue.url(file_link(bench, unit, Path(f).name)) for k, f in files.items()},
+        }
         return result(bench, VIDEO, {"": made}, metadata, ["whole"])
 
     return rollout_video
@@ -242,6 +248,7 @@ def _rerun_recording(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
         path = bench.plan.folder(unit) / "held_out.rrd"
         metadata = {
             "file": dg.MetadataValue.path(str(path)),
+            "download": dg.MetadataValue.url(file_link(bench, unit, path.name)),
             "open_with": f"rerun --bind 127.0.0.1 {path}",
             "episodes": dg.MetadataValue.json(made.summary["episodes"]),
             "size_mb": made.summary["size_mb"],

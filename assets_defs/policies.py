@@ -11,8 +11,9 @@ from pathlib import Path
 import dagster as dg
 
 from assets_defs.data import PARTITIONS, demonstrations, episode_split, windows
+from assets_defs.links import mlflow_links
 from assets_defs.plan import Unit
-from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, mlflow_links, result
+from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import picture, present, table
 from pipeline.experiment import Variant
 from pipeline.store import Made
@@ -78,7 +79,7 @@ def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
             for unit in bench.plan.selected_units(variant, "trained_policy")
         }
         header = ["observations", "parameters", "steps", "training s", "CPU s", "GPU memory, MB", "last loss"]
-        metadata = {"training": table(header, rows), **plots, **mlflow_links(made)}
+        metadata = {"training": table(header, rows), **plots, **mlflow_links(bench, made)}
         return result(bench, asset_key, made, present(metadata), ["finite_losses"])
 
     return trained_policy

@@ -4,6 +4,8 @@ A Dagster resource here is a shell around plain objects. What belongs here: open
 asset's results are made, published, checked and described. What does not: what any asset computes.
 """
 
+import os
+import socket
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,16 +29,31 @@ if TYPE_CHECKING:
 Say = Callable[[str], None]
 
 
+PID_TAG, HOST_TAG = "demobench/pid", "demobench/host"
+"""The process that makes a run, as tags of the run: where it is gone, so is the run (`launch.close_dead_runs`)."""
+
+
 class Budget(dg.ConfigurableResource):
     """The few settings people change at launch. Left empty, the data set's own settings hold.
 
     Other numbers of seeds or steps make a variant: it is stored under a key of its own and never overwrites anything.
     """
 
-    seeds: int | None = None
-    steps: int | None = None
-    observations: list[str] = Field(default_factory=list)
-    policies: list[str] = Field(default_factory=list)
+    seeds: int | None = Field(None, ge=1, description="Training runs of each policy, from different random numbers.")
+    steps: int | None = Field(None, ge=1, description="Training steps of each policy.")
+    observations: list[str] = Field(
+        default_factory=list, description='Observation sets, by name, for example ["pose"]; empty: all.'
+    )
+    policies: list[str] = Field(
+        default_factory=list,
+        description='Policies, by the name of their group, for example ["mlp_k16"]; empty: all but those that must be named.',
+    )
+
+    def setup_for_execution(self, context: dg.InitResourceContext) -> None:
+        """Note on the run which process makes it. A run that is made again brings the tags of the first one along."""
+        if context.instance and context.run_id:
+            made_by = {PID_TAG: str(os.getpid()), HOST_TAG: socket.gethostname()}
+            context.instance.add_run_tags(context.run_id, made_by)
 
     def asks_for(self, variant: Variant) -> bool:
         """Whether the launch named this policy, or named none and it need not be named."""
@@ -218,14 +235,6 @@ class Bench:
                 f"{self.outbox.folder}."
             )
         return self.store.made(folder) or made
-
-
-def mlflow_links(made: Mapping[str, Made]) -> dict[str, dg.MetadataValue]:
-    """The id of the MLflow run of every entry."""
-    return {
-        f"mlflow_{entry}": dg.MetadataValue.text(m.summary.get("mlflow_run_id") or "not sent yet")
-        for entry, m in made.items()
-    }
 
 
 def result(

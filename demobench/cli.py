@@ -480,17 +480,20 @@ def selftest(
         raise typer.Exit(1)
 
 
-@app.command(epilog="Examples:\n\n    demobench ui\n\n    demobench ui --port 3001 --mlflow-port 5001")
+@app.command(
+    epilog="Examples:\n\n    demobench ui\n\n    demobench ui --port 3100 --files-port 3101 --mlflow-port 5100"
+)
 def ui(
     port: Annotated[int, typer.Option(min=1, max=65535, help="Dagster's port.")] = 3000,
     mlflow_port: Annotated[int, typer.Option(min=1, max=65535, help="MLflow's port.")] = 5000,
+    files_port: Annotated[int, typer.Option(min=1, max=65535, help="The port of reports and recordings.")] = 3001,
     config: ConfigOption = None,
     store: StoreOption = None,
 ) -> None:
-    """Dagster and MLflow in the browser, on 127.0.0.1. Ctrl-C stops both."""
+    """Dagster, MLflow and the reports in the browser, on 127.0.0.1. Ctrl-C stops all."""
     from demobench.commands.ui import serve
 
-    serve(port, mlflow_port, config, store)
+    serve(port, mlflow_port, files_port, config, store)
 
 
 @record_app.command("pusht", epilog="Example:\n\n    demobench record pusht my_pusht --episodes 20 --seed 1")

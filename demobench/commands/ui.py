@@ -1,4 +1,4 @@
-"""`demobench ui`: Dagster and MLflow as two child processes on 127.0.0.1, stopped together."""
+"""`demobench ui`: Dagster and MLflow as two child processes on 127.0.0.1, the store's files beside them; stopped together."""
 
 import os
 import signal
@@ -12,15 +12,15 @@ from pathlib import Path
 
 from rich.console import Console
 
+from assets_defs.links import HOST, Served, remember_served
+from demobench.commands.files import FileServer
 from demobench.commands.session import Session, open_session, tell_mlflow
 from pipeline.errors import DemobenchError
-from pipeline.sinks.to_mlflow import tracking_uri
-
-HOST = "127.0.0.1"
+from pipeline.sinks.to_mlflow import tracking_uri, without_secret
 
 
-def serve(port: int, mlflow_port: int, config_path: Path | None, store_path: str | None) -> None:
-    """Start both servers and wait; Ctrl-C or SIGTERM stops them.
+def serve(port: int, mlflow_port: int, files_port: int, config_path: Path | None, store_path: str | None) -> None:
+    """Start the servers and wait; Ctrl-C or SIGTERM stops them.
 
     Raises:
         DemobenchError: a port is in use, or a server ended by itself.
@@ -28,19 +28,24 @@ def serve(port: int, mlflow_port: int, config_path: Path | None, store_path: str
     session = open_session(config_path, store_path)
     session.store.ensure()
     sqlite = session.config.tracking.mlflow == "sqlite"
-    _check_free(port, "--port")
-    if sqlite:
-        _check_free(mlflow_port, "--mlflow-port")
+    wanted = {"--port": port, "--files-port": files_port} | ({"--mlflow-port": mlflow_port} if sqlite else {})
+    for option, number in wanted.items():
+        _check_free(number, option)
+    if len(set(wanted.values())) < len(wanted):
+        raise DemobenchError(f"Every server needs a port of its own: {', '.join(wanted)} are not all different.")
+    _close_dead_runs(session)
+    remember_served(session.store, Served(f"http://{HOST}:{files_port}", f"http://{HOST}:{mlflow_port}"))
     # Set before the servers start: a signal that a shell told us to ignore would be ignored by them too.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     tell_mlflow(session)
-    with tempfile.TemporaryDirectory(prefix="demobench-") as scratch:
+    with tempfile.TemporaryDirectory(prefix="demobench-") as scratch, FileServer(session.store, files_port):
         processes = {"Dagster": _dagster(session, port, Path(scratch), config_path)}
         if sqlite:
             processes["MLflow"] = _mlflow(session, mlflow_port)
         try:
-            _announce(session.console, port, mlflow_port if sqlite else None, session.config.tracking.mlflow)
+            mlflow = f"http://{HOST}:{mlflow_port}" if sqlite else session.config.tracking.mlflow
+            _announce(session.console, f"http://{HOST}:{port}", mlflow, f"http://{HOST}:{files_port}")
             _wait(processes)
         except KeyboardInterrupt:
             session.console.print("stopped")
@@ -57,6 +62,14 @@ def _check_free(port: int, option: str) -> None:
             raise DemobenchError(
                 f"Port {port} on {HOST} cannot be used: {error.strerror}. Choose another with {option}."
             ) from None
+
+
+def _close_dead_runs(session: Session) -> None:
+    from assets_defs.launch import close_dead_runs, open_instance
+
+    with open_instance(session.store.root) as instance:
+        for run_id in close_dead_runs(instance):
+            session.console.print(f"closed run {run_id[:8]}, whose process was gone")
 
 
 def _dagster(session: Session, port: int, scratch: Path, config_path: Path | None) -> subprocess.Popen:
@@ -96,10 +109,11 @@ def _start(command: list[str], environment: Mapping[str, str]) -> subprocess.Pop
     )
 
 
-def _announce(console: Console, port: int, mlflow_port: int | None, mlflow: str) -> None:
-    console.print(f"Dagster  http://{HOST}:{port}   (ready in about 15 s)")
-    console.print(f"MLflow   {f'http://{HOST}:{mlflow_port}' if mlflow_port else mlflow}")
-    console.print("Ctrl-C stops both.")
+def _announce(console: Console, dagster: str, mlflow: str, files: str) -> None:
+    console.print(f"Dagster  {dagster}   (ready in about 15 s)")
+    console.print(f"MLflow   {without_secret(mlflow)}")
+    console.print(f"Reports  {files}")
+    console.print("Ctrl-C stops all.")
 
 
 def _wait(processes: Mapping[str, subprocess.Popen]) -> None:

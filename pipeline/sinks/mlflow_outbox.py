@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import StoreError, printable
-from pipeline.sinks.to_mlflow import Message, RunCard, Series, tracking_uri
+from pipeline.sinks.to_mlflow import Message, RunCard, Series, tracking_uri, without_secret
 from pipeline.store import Store, drafted
 
 BATCH = 1000
@@ -49,8 +49,16 @@ class Outbox:
     @property
     def address(self) -> str:
         """Where MLflow is, without a user and password that somebody may have put into it."""
-        scheme, _, rest = self._uri.partition("://")
-        return f"{scheme}://{rest.rpartition('@')[2]}"
+        return without_secret(self._uri)
+
+    def experiment_id(self, name: str) -> str | None:
+        """The id of MLflow's experiment of that name; None where it has none, or does not answer."""
+        if self._is_silent():
+            return None
+        with suppress(*_mlflow_errors()), _client(self._uri) as client:
+            found = client.get_experiment_by_name(name)
+            return found and found.experiment_id
+        return None
 
     def waiting(self) -> list[Path]:
         """The messages that were not sent, in the order in which they were made."""

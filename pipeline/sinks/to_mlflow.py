@@ -24,6 +24,12 @@ def tracking_uri(setting: str, store_root: Path) -> str:
     return f"sqlite:///{store_root / 'mlflow.db'}" if setting == "sqlite" else setting
 
 
+def without_secret(uri: str) -> str:
+    """The address without a user and password that somebody may have put into it."""
+    scheme, _, rest = uri.partition("://")
+    return f"{scheme}://{rest.rpartition('@')[2]}"
+
+
 @dataclass(frozen=True)
 class RunCard:
     """Everything needed to find an MLflow run, or to open it where there is none (a new server, a store that was deleted).

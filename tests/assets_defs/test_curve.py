@@ -129,7 +129,7 @@ def test_it_is_no_part_of_a_benchmark_and_has_a_job_of_its_own(drawn):
     assert "learning_curve" not in of_benchmark
     assert "learning_curve" not in {unit.asset for unit in benchmark.plan().units()}
     node = defs.resolve_asset_graph().get(dg.AssetKey(["learning_curve"]))
-    assert node.group_name == "floor"
+    assert node.group_name == "benchmark"
     assert dg.AssetKey(["mlp_k01", "predictions"]) in node.parent_keys
 
 

@@ -175,3 +175,14 @@ def test_a_name_must_be_free_and_a_name(copied):
             check_name(name, experiment)
     with pytest.raises(ConfigError):
         check_name("../outside", experiment)
+
+
+def test_with_nothing_to_score_it_stops_nothing(copied):
+    # The last test of this file: it takes away what was scored.
+    for folder in copied.plan().folder(Unit(SCORED)).glob("*"):
+        shutil.rmtree(folder)
+    run, why = run_score(copied, [dg.AssetKey([SCORED])], None)
+    assert run.is_success, why
+    with open_instance(copied.store.root) as instance:
+        event = instance.get_latest_materialization_event(dg.AssetKey([SCORED]))
+    assert "Nothing was scored yet" in event.asset_materialization.metadata["nothing"].value

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 import urllib.request
-from pathlib import Path
 
 import pytest
 
@@ -26,10 +25,14 @@ folds = 1
 threads = 1
 [datasets.tape]
 source = "tape"
+[datasets.film]
+source = "film"
 [policies.mlp]
 method = "mlp"
 chunks = [1]
 """
+PATIENCE_MS = 120_000
+ENDED = ("SUCCESS", "FAILURE", "CANCELED")
 REEXECUTE = """
 mutation Again($parent: String!) {
   launchRunReexecution(reexecutionParams: {parentRunId: $parent, strategy: ALL_STEPS}) {
@@ -64,12 +67,13 @@ def served(tmp_path_factory):
     """A finished run of the command line, and both servers over its store."""
     place = tmp_path_factory.mktemp("user")
     write_v3(place / "tape", tiny_recording(episodes=6, frames=40))
+    write_v3(place / "film", tiny_recording(episodes=6, frames=40, seed=1))
     (place / "demobench.toml").write_text(CONFIG)
     environment = {**os.environ, "NO_COLOR": "1"}
     command = [sys.executable, "-m", "demobench.cli"]
-    subprocess.run([*command, "run"], cwd=place, env=environment, check=True, timeout=300, capture_output=True)
-    port, mlflow_port = free_port(), free_port()
-    ports = ["--port", str(port), "--mlflow-port", str(mlflow_port)]
+    subprocess.run([*command, "run", "tape"], cwd=place, env=environment, check=True, timeout=300, capture_output=True)
+    port, mlflow_port, files_port = free_port(), free_port(), free_port()
+    ports = ["--port", str(port), "--mlflow-port", str(mlflow_port), "--files-port", str(files_port)]
     process = subprocess.Popen([*command, "ui", *ports], cwd=place, env=environment, stdout=subprocess.PIPE, text=True)
     dagster, mlflow = f"http://127.0.0.1:{port}", f"http://127.0.0.1:{mlflow_port}"
     try:
@@ -92,13 +96,19 @@ def graphql(address: str, query: str, **variables) -> dict:
 
 
 def runs(address: str) -> list[dict]:
-    query = "{runsOrError {... on Runs {results {runId status parentRunId}}}}"
-    return graphql(address, query)["runsOrError"]["results"]
+    """All runs, the newest first, with the data set and the links that their tags name."""
+    query = "{runsOrError {... on Runs {results {runId status parentRunId tags {key value}}}}}"
+    found = graphql(address, query)["runsOrError"]["results"]
+    return [
+        run
+        | {"tags": (tags := {t["key"]: t["value"] for t in run["tags"]}), "partition": tags.get("dagster/partition")}
+        for run in found
+    ]
 
 
 def test_the_ui_runs_the_command_lines_run_again(served):
     place, dagster, _ = served
-    (first,) = runs(dagster)
+    first = runs(dagster)[-1]
     assert first["status"] == "SUCCESS"
     before = {p: p.read_text() for p in (place / "results" / "datasets").rglob("made.json")}
     answer = graphql(dagster, REEXECUTE, parent=first["runId"])["launchRunReexecution"]
@@ -112,36 +122,87 @@ def test_the_ui_runs_the_command_lines_run_again(served):
     assert after == before, "nothing was stale, so the second run made nothing again"
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine (Debian: apt-get install chromium)")
-def test_chromium_sees_the_graph_the_run_and_mlflow(served, tmp_path):
+@pytest.fixture(scope="module")
+def window():
+    """A page of a real browser, and what any page that it opened complained about."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine (Debian: apt-get install chromium)")
     from playwright.sync_api import sync_playwright
 
-    _, dagster, mlflow = served
-    errors: list[str] = []
+    complaints: list[str] = []
+
+    def listen(page) -> None:
+        page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+
     with sync_playwright() as play:
         flags = ["--no-sandbox", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=flags)
-        page = browser.new_page(viewport={"width": 1600, "height": 1000})
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.goto(f"{dagster}/asset-groups")
-        page.get_by_text("mlp_k01").first.wait_for(timeout=60_000)
-        page.get_by_text("benchmark").first.wait_for(timeout=60_000)
-        page.goto(f"{dagster}/runs")
-        page.get_by_text("tape").first.wait_for(timeout=60_000)
-        page.get_by_text("Success").first.wait_for(timeout=60_000)
-        page.goto(f"{dagster}/assets/benchmark_table?partition=tape")
-        page.get_by_text("first_step_mae_hold_still_state").first.wait_for(timeout=60_000)
-        page.goto(f"{mlflow}/#/experiments")
-        page.get_by_text("tape").first.wait_for(timeout=60_000)
+        browser = play.chromium.launch(executable_path=CHROMIUM, args=flags, timeout=PATIENCE_MS)
+        context = browser.new_context(viewport={"width": 1600, "height": 1000})
+        context.set_default_timeout(PATIENCE_MS)
+        context.on("page", listen)
+        yield context.new_page(), complaints
         browser.close()
-    assert not [e for e in errors if dagster in e]
 
 
-def test_a_port_in_use_is_one_message(served):
+def test_a_whole_graph_is_made_from_the_ui_and_leads_to_its_report_and_to_mlflow(served, window):
+    place, dagster, mlflow = served
+    page, complaints = window
+    page.goto(f"{dagster}/asset-groups")
+    for group in ("data", "floor", "mlp_k01", "benchmark", "looking"):
+        page.get_by_text(group, exact=True).first.wait_for()
+
+    launch(page, dagster, "film")
+    made = wait_for(lambda: [r for r in runs(dagster) if r["partition"] == "film" and r["status"] in ENDED], 500)
+    assert [run["status"] for run in made] == ["SUCCESS"]
+    table = json.loads((place / "results" / "datasets" / "film" / "benchmark_table" / "table.json").read_text())
+
+    page.goto(f"{dagster}/assets/benchmark_table?partition=film")
+    still = next(row["first_step_mae"] for row in table["policies"] if row["policy"] == "hold_still")
+    page.get_by_text("mae_hold_still_state").first.wait_for()
+    page.get_by_text(f"{still:.4g}", exact=True).first.wait_for()
+
+    with page.expect_popup() as opened:
+        page.get_by_role("link", name="/film/benchmark_report/report.html").first.click()
+    opened.value.get_by_role("heading", name="film", exact=True).wait_for()
+    opened.value.locator("[data-chart] svg").first.wait_for()
+    with page.expect_popup() as opened:
+        page.get_by_role("link", name=f"{mlflow}/#/experiments/").first.click()
+    opened.value.get_by_text("mlp_k01/state").first.wait_for()
+
+    page.goto(f"{dagster}/assets/mlp_k01/trained_policy?partition=film")
+    with page.expect_popup() as opened:
+        page.get_by_role("link", name=f"{mlflow}/#/runs/").first.click()
+    opened.value.get_by_text("mlp_k01/state").first.wait_for()
+    assert not complaints
+
+
+def launch(page, dagster: str, partition: str) -> None:
+    """Start the job `benchmark` for one data set with the mouse, as people do."""
+    page.goto(f"{dagster}/locations/demobench/jobs/benchmark")
+    page.get_by_role("button", name="Materialize all").first.click()
+    page.get_by_role("button", name="Confirm").click()  # "upstream assets have not been materialized yet": see docs
+    page.get_by_text("Select a partition or create one").first.click()
+    page.get_by_text(partition, exact=True).locator("visible=true").last.click()
+    page.get_by_text("Launch runs to materialize").click()  # closes the list
+    page.get_by_role("button", name="Launch 1 run").click()
+
+
+@pytest.mark.parametrize("option", ["--port", "--files-port", "--mlflow-port"])
+def test_a_port_in_use_is_one_message(served, option):
     place, dagster, _ = served
     port = dagster.rsplit(":", 1)[1]
-    words = [sys.executable, "-m", "demobench.cli", "ui", "--port", port]
+    words = [sys.executable, "-m", "demobench.cli", "ui", option, port]
     out = subprocess.run(words, cwd=place, capture_output=True, text=True, timeout=60, check=False)
     assert out.returncode == 2
-    assert f"Port {port} on 127.0.0.1 cannot be used" in " ".join(out.stderr.split())
-    assert Path(place / "results").is_dir()
+    said = " ".join(out.stderr.split())
+    assert said.startswith(f"error: Port {port} on 127.0.0.1 cannot be used")
+    assert said.endswith(f"Choose another with {option}.")
+
+
+def test_two_servers_on_one_port_is_one_message(tmp_path):
+    port = str(free_port())
+    words = [sys.executable, "-m", "demobench.cli", "ui", "--port", port, "--files-port", port]
+    out = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert out.returncode == 2
+    assert "Every server needs a port of its own" in " ".join(out.stderr.split())

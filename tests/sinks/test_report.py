@@ -321,6 +321,26 @@ def test_charts_follow_the_readers_setting(browser, tmp_path, table, figures, sc
     page.close()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize(
+    "viewport", [{"width": 1300, "height": 900}, {"width": 390, "height": 844}], ids=["desk", "phone"]
+)
+def test_axe_finds_nothing_serious(browser, tmp_path, table, figures, clip, viewport, scheme):
+    from axe_playwright_python.sync_playwright import Axe
+
+    table["sensors"] = [make_sensor()]
+    table["comparisons"] += [make_comparison("mlp_k04/state", "mlp_k01/state", "cannot tell", words="needs " * 20)]
+    write_report(tmp_path / "report.html", table, figures, PROVENANCE, [clip])
+    page, _, _ = visit(browser, tmp_path / "report.html", viewport=viewport, color_scheme=scheme)
+    for folded in page.locator("details").all():
+        folded.evaluate("element => element.open = true")
+    found = Axe().run(page).response["violations"]
+    page.close()
+    serious = [one for one in found if one["impact"] in ("serious", "critical")]
+    assert not serious, [(one["id"], [node["html"][:200] for node in one["nodes"]]) for one in serious]
+
+
 def test_a_phone_scrolls_the_table_and_nothing_else(browser, tmp_path, table, figures):
     table["sensors"] = [make_sensor()]
     table["comparisons"] += [make_comparison("mlp_k04/state", "mlp_k01/state", "cannot tell", words="needs " * 20)]
