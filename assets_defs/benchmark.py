@@ -75,7 +75,7 @@ def _links(context: dg.AssetExecutionContext, bench: Bench) -> dict[str, dg.UrlM
         "report": file_link(bench, Unit("benchmark_report"), "report.html"),
         "mlflow": experiment_link(bench, bench.outbox.experiment_id(bench.plan.key)),
     }
-    context.instance.add_run_tags(context.run_id, {f"demobench/{name}": link for name, link in links.items()})
+    context.instance.add_run_tags(context.run.run_id, {f"demobench/{name}": link for name, link in links.items()})
     return {name: dg.MetadataValue.url(link) for name, link in links.items()}
 
 

@@ -51,9 +51,9 @@ class Budget(dg.ConfigurableResource):
 
     def setup_for_execution(self, context: dg.InitResourceContext) -> None:
         """Note on the run which process makes it. A run that is made again brings the tags of the first one along."""
-        if context.instance and context.run_id:
+        if context.instance and context.run:
             made_by = {PID_TAG: str(os.getpid()), HOST_TAG: socket.gethostname()}
-            context.instance.add_run_tags(context.run_id, made_by)
+            context.instance.add_run_tags(context.run.run_id, made_by)
 
     def asks_for(self, variant: Variant) -> bool:
         """Whether the launch named this policy, or named none and it need not be named."""
