@@ -1,4 +1,4 @@
-"""Showing a run while it works: bars on a terminal, plain lines elsewhere, and the one message when it fails."""
+"""Showing a run while it works: a tree on a terminal, plain lines elsewhere, and the one message when it fails."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -6,63 +6,46 @@ from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
+from rich.live import Live
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
     SpinnerColumn,
-    Task,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.text import Text
 
+from demobench.asset_tree import AssetTree, clock
 from pipeline import errors
 from pipeline.errors import DemobenchError
 from pipeline.experiment import Target
 
 
-class _Rate(TextColumn):
-    """Steps a second, while there is something to count."""
-
-    def __init__(self) -> None:
-        super().__init__("")
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        return Text(f"{speed:,.0f}/s" if speed and task.total and task.total > 1 else "", style="progress.data.speed")
-
-
 class RunProgress:
-    """Bars for one run: the assets done, and the steps of the asset at work.
+    """One run on standard error: the tree of its assets on a terminal, else a line for each that is made.
 
     While Dagster captures the output of assets, file descriptors 1 and 2 point into its logs: a duplicate of standard
     error, taken before, still reaches the terminal.
     """
 
-    def __init__(self, console: Console, target: Target, stale: Sequence[Any]):
+    def __init__(self, console: Console, target: Target, assets: Sequence[str], stale: Sequence[str]):
         self._target = target
-        self._assets = list(dict.fromkeys(unit.asset for unit in stale))
         self._stream = os.fdopen(os.dup(2), "w")
         self._console = Console(file=self._stream, highlight=False, no_color=console.no_color)
-        self._live = self._console.is_terminal
+        self._is_live = self._console.is_terminal and not self._console.is_dumb_terminal
         self._failures: dict[str, DemobenchError | None] = {}
         self._failed_checks: dict[str, str] = {}
-        self._done = 0
-        self._bars = Progress(
-            SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn(), _Rate(),
-            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("[dim]{task.fields[note]}"),
-            console=self._console, transient=True, disable=not self._live,
-        )  # fmt: skip
+        self._tree = AssetTree(target.key, target.experiment.budget_words, assets, stale)
+        self._live = Live(self._tree, console=self._console, transient=True)
 
     def __enter__(self) -> "RunProgress":
-        self.say(
-            f"[bold]{self._target.key}[/]: {len(self._assets)} assets to make, {self._target.experiment.budget_words}"
-        )
-        self._bars.start()
-        self._whole = self._bars.add_task(self._target.key, total=len(self._assets), note="")
-        self._current = self._bars.add_task("starting", total=None, note="", visible=self._live)
+        if self._is_live:
+            self._live.start()
+        else:
+            words = f"{self._tree.to_make} assets to make, {self._target.experiment.budget_words}"
+            self.say(f"[bold]{self._target.key}[/]: {words}")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -70,32 +53,35 @@ class RunProgress:
         self._stream.close()
 
     def stop(self) -> None:
-        self._bars.stop()
+        """The tree goes, and the cursor is back; the number of assets and the time stay."""
+        if self._live.is_started:
+            self._live.stop()
+            self.say(f"[bold]{self._target.key}[/]: {self._tree.made} assets made in {clock(self._tree.seconds)}")
 
     def say(self, line: str) -> None:
         self._console.print(line, soft_wrap=True)
 
     def report(self, what: str, done: int, total: int, note: str) -> None:
         """What the asset at work says about itself; called from inside the run."""
-        self._bars.update(self._current, description=what, completed=done, total=total, note=note)
+        self._tree.count(what, done, total, note)
 
     def on_event(self, event: Any) -> None:
         """One Dagster event."""
         kind = event.event_type_value
         if kind == "STEP_START":
-            self._bars.reset(self._current, total=None, description=self._asset_of(event), note="")
+            self._tree.start(self._asset_of(event))
         elif kind == "STEP_SUCCESS":
-            self._done += 1
-            self._bars.advance(self._whole)
-            if not self._live:
-                seconds = event.event_specific_data.duration_ms / 1000
-                self.say(f"[{self._done:>2}/{len(self._assets)}] {self._asset_of(event)} {seconds:.1f} s")
+            asset, seconds = self._asset_of(event), event.event_specific_data.duration_ms / 1000
+            self._tree.finish(asset, seconds)
+            if not self._is_live:
+                self.say(f"[{self._tree.made:>2}/{self._tree.to_make}] {asset} {seconds:.1f} s")
         elif kind == "ASSET_CHECK_EVALUATION" and _stops(event.event_specific_data):
             check, asset = event.event_specific_data, event.event_specific_data.asset_key.to_user_string()
             why = check.metadata["why"].value if "why" in check.metadata else ""
             kept = "Nothing that depends on it was made; results before it are kept."
             self._failed_checks.setdefault(asset, f"{asset}: check '{check.check_name}' failed: {why}. {kept}")
         elif kind == "STEP_FAILURE" or (kind in ("RUN_FAILURE", "PIPELINE_FAILURE") and not self._failures):
+            self._tree.fail(self._asset_of(event))
             self._failures[self._asset_of(event)] = _failure_of(getattr(event.event_specific_data, "error", None))
 
     @staticmethod

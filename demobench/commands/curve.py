@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from demobench.commands.run import check_source, materialise
-from demobench.commands.session import Session, open_session, short, write_json_to
+from demobench.commands.session import Session, open_session, short, tell_mlflow, write_json_to
 from pipeline.experiment import Choices, Target, parse_list, parse_sizes, resolve_target
 
 
@@ -43,17 +43,19 @@ def run_curve(
     session.store.ensure()
     with session.store.lock(target.key):
         session.store.register(target.key, target.experiment.model_dump(mode="json"))
-        stale = plan.stale(plan.curve_units(curves))
+        units = plan.curve_units(curves)
+        stale = plan.stale(units)
         if stale:
             _check_sizes(target, plan, session, asked)
         ops = {"learning_curve": {"sizes": list(asked)}}
         sets = tuple(curve.entry.split("/")[1] for curve in curves)
-        materialise(replace(target, observations=sets), session, list(stale), job="curve", ops=ops)
+        materialise(replace(target, observations=sets), session, units, list(stale), job="curve", ops=ops)
     plan.forget()
     read = [_read(curve, plan, more, worthwhile) for curve in curves]
     for curve, found in zip(curves, read, strict=True):
         _show(found, plan.folder(curve), session.console)
     session.console.print(f"[dim]The report shows it from the next run on: demobench run {escape(target.key)}[/]")
+    tell_mlflow(session)
     write_json_to(json_to, read[0] | {"others": read[1:]})
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from demobench.commands.session import Session, open_session, program, short, write_json_to
+from demobench.commands.session import Session, open_session, program, short, tell_mlflow, write_json_to
 from pipeline.errors import ConfigError, StoreError
 from pipeline.experiment import Choices, Target, parse_chunks, parse_list, resolve_target, select_rows
 from pipeline.methods import METHODS, is_own
@@ -17,7 +17,7 @@ from pipeline.methods import METHODS, is_own
 if TYPE_CHECKING:
     from dagster import DagsterInstance, Definitions
 
-    from assets_defs.plan import Plan
+    from assets_defs.plan import Plan, Unit
     from demobench.progress import PoliciesFailed, RunProgress
 
 
@@ -46,7 +46,9 @@ def run_benchmarks(
     targets = [resolve_target(n, session.config, session.config_dir, chosen, registered) for n in names]
     check_source(targets, session)
     session.store.ensure()
+    tell_mlflow(session, first=True)
     results, failures = zip(*(_run_one(target, session) for target in targets), strict=True)
+    tell_mlflow(session)
     write_json_to(json_to, list(results))
     for failure in filter(None, failures):
         raise failure
@@ -93,26 +95,32 @@ def _make(target: Target, session: Session) -> "PoliciesFailed | None":
     from demobench.progress import PoliciesFailed
 
     try:
-        materialise(target, session, list(_plan(target, session).stale()))
+        _make_stale(target, session)
     except PoliciesFailed as failure:
         others = tuple(v for v in target.selected if v.name not in failure.why)
         if not others:
             raise
-        rest = replace(target, selected=others)
-        materialise(rest, session, list(_plan(rest, session).stale()))
+        _make_stale(replace(target, selected=others), session)
         return failure
     return None
+
+
+def _make_stale(target: Target, session: Session) -> None:
+    plan = _plan(target, session)
+    materialise(target, session, plan.units(), list(plan.stale()))
 
 
 def materialise(
     target: Target,
     session: Session,
-    stale: Sequence[Any],
+    units: Sequence["Unit"],
+    stale: Sequence["Unit"],
     *,
     job: str | None = None,
     ops: Mapping[str, Any] | None = None,
 ) -> None:
-    """Make stale results as a Dagster run of a job (the benchmark by default) with bars; say so where there are none.
+    """Make those of `units` that are stale as a Dagster run of a job (the benchmark by default), and show it; say so where none
+    are.
 
     `ops` are settings of single assets.
 
@@ -128,7 +136,11 @@ def materialise(
 
     from demobench.progress import RunProgress
 
-    with RunProgress(session.console, target, stale) as progress, _dagster(target, session, progress) as dagster:
+    assets, making = [u.asset for u in units], [u.asset for u in stale]
+    with (
+        RunProgress(session.console, target, assets, making) as progress,
+        _dagster(target, session, progress) as dagster,
+    ):
         from assets_defs.automation import BENCHMARK
         from assets_defs.launch import run_benchmark
         from assets_defs.resources import asset_keys

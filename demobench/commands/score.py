@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rich.markup import escape
 
 from demobench.commands.run import check_source, collect, materialise, show
-from demobench.commands.session import Session, open_dataset, open_session, write_json_to
+from demobench.commands.session import Session, open_dataset, open_session, tell_mlflow, write_json_to
 from pipeline.errors import ConfigError, StoreError, did_you_mean
 from pipeline.experiment import Target
 from pipeline.store import write_json
@@ -345,7 +345,7 @@ def _make_stale(opened: Opened, plan: "Plan", request: "Request | None") -> None
     stale = list(plan.stale())
     chosen = replace(target, selected=tuple(v for v in target.experiment.variants if v.name in plan.selected))
     scores = request is not None and any(unit.asset == SCORED for unit in stale)
-    materialise(chosen, session, stale, job=SCORE, ops={SCORED: request.config()} if scores else None)
+    materialise(chosen, session, plan.units(), stale, job=SCORE, ops={SCORED: request.config()} if scores else None)
 
 
 def _show_table(opened: Opened, plan: "Plan", name: str | None, json_to: str | None) -> None:
@@ -355,6 +355,7 @@ def _show_table(opened: Opened, plan: "Plan", name: str | None, json_to: str | N
     report = collect(target, plan, opened.session)
     marked = next((row for row in report["policies"] if row["policy"] == name), None)
     show(report, target, opened.session, marked and f"{name}/{marked['observations']}")
+    tell_mlflow(opened.session)
     write_json_to(json_to, [report])
 
 
