@@ -9,8 +9,10 @@ import json
 import os
 import re
 import tomllib
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
+from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 
@@ -256,6 +258,38 @@ class ScheduleConfig(Settings):
     cron: str = "0 3 * * 1"
 
 
+class NotifyConfig(Settings):
+    """Who is told of a regression, a failed run and a new champion: a command, a webhook, both, or (by default) nobody."""
+
+    command: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
+    webhook: str | None = None
+
+    @model_validator(mode="after")
+    def _webhook_is_private(self):
+        if self.webhook is None:
+            return self
+        # The address is left out of the message: those of many services are secrets.
+        try:
+            address = urlsplit(self.webhook)
+            scheme, host, _ = address.scheme, address.hostname, address.port
+        except ValueError:
+            scheme, host = "", None
+        if not host or not (scheme == "https" or (scheme == "http" and is_loopback(host))):
+            raise ConfigError(
+                "[notify] webhook must be an https:// address, or http:// on this machine, for example "
+                '"https://example.org/hook" or "http://127.0.0.1:8080/hook".'
+            )
+        return self
+
+
+def is_loopback(host: str | None) -> bool:
+    """Whether a host is this machine, by its name alone: nothing is looked up."""
+    try:
+        return host == "localhost" or ip_address(host or "").is_loopback
+    except ValueError:
+        return False
+
+
 BASELINES = {
     name: PolicyConfig(method=name) for name in ("hold_still", "mean_action", "constant_velocity", "nearest_neighbour")
 }
@@ -303,6 +337,7 @@ class Config(Settings):
     datasets: dict[str, DatasetConfig] = {"pusht_sim": PUSHT_SIM, "so101_sim": SO101_SIM}
     policies: dict[str, PolicyConfig] = DEFAULT_POLICIES
     schedule: ScheduleConfig = ScheduleConfig()
+    notify: NotifyConfig = NotifyConfig()
 
     @model_validator(mode="after")
     def _names_are_slugs(self):
@@ -428,6 +463,7 @@ def _keys_at(path: list[str]) -> list[str]:
     blocks = {
         "store": StoreConfig, "tracking": TrackingConfig, "benchmark": BenchmarkConfig,
         "datasets": DatasetConfig, "policies": PolicyConfig, "schedule": ScheduleConfig,
+        "notify": NotifyConfig,
     }  # fmt: skip
     model = blocks.get(path[0], Config) if path else Config
     if path[:1] == ["policies"] and path[2:] == ["augment"]:

@@ -64,6 +64,7 @@ def test_every_key_of_the_configuration_is_described():
         "datasets": config.DatasetConfig,
         "policies": config.PolicyConfig,
         "schedule": config.ScheduleConfig,
+        "notify": config.NotifyConfig,
     }
     assert set(blocks) == set(config.Config.model_fields)
     for name, model in blocks.items():

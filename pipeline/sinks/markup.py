@@ -30,7 +30,7 @@ def element(tag: str, *children: Any, **attributes: Any) -> Html:
         name = name.rstrip("_").replace("_", "-")
         head.append(name if value is True else f'{name}="{html.escape(str(value))}"')
     opening = f"<{' '.join(head)}>"
-    return Html(opening) if tag in ("br", "meta", "link") else Html(f"{opening}{join(*children)}</{tag}>")
+    return Html(opening) if tag in ("br", "img", "meta", "link") else Html(f"{opening}{join(*children)}</{tag}>")
 
 
 def join(*children: Any) -> Html:
