@@ -1,15 +1,17 @@
-"""What runs by itself (a weekly schedule, and the sensor that makes the file's data sets appear as partitions), and the jobs."""
+"""What runs by itself (a weekly schedule; sensors of new revisions, new data sets and failed runs), and the jobs."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import dagster as dg
 
 from assets_defs.data import PARTITIONS
-from assets_defs.plan import Plan
+from assets_defs.plan import Plan, Unit
 from assets_defs.resources import Workbench, asset_keys
+from pipeline import errors
 from pipeline.config import Config
+from pipeline.errors import DemobenchError
 from pipeline.experiment import Variant
 
 BENCHMARK = "benchmark"
@@ -50,7 +52,7 @@ def automation(config: Config, policies: Sequence[Variant]) -> dict[str, list[An
     return {
         "jobs": [benchmark, rebenchmark, curve, score],
         "schedules": [_weekly(config, rebenchmark)],
-        "sensors": [register_datasets, _new_revision(rebenchmark)],
+        "sensors": [register_datasets, _new_revision(rebenchmark), run_failed],
     }
 
 
@@ -59,6 +61,23 @@ def stale_assets(workbench: Workbench, key: str) -> list[dg.AssetKey]:
     by_itself = tuple(v.name for v in workbench.variants if not v.only_when_named)
     plan = Plan(workbench.store, key, workbench.experiment(key), workbench.variants, by_itself)
     return asset_keys(plan.stale())
+
+
+def requests_for(
+    workbench: Workbench, keys: Iterable[str], say: Callable[[str], None], run_key: Callable[[str], str]
+) -> list[dg.RunRequest]:
+    """A run for each data set that has work to do. One that cannot be looked at must not keep the others from theirs: what is
+    wrong with it goes to `say`, and its run, which fails and says the same where people look, is asked for all the same."""
+    requests = []
+    for key in keys:
+        try:
+            stale = stale_assets(workbench, key)
+        except DemobenchError as error:
+            say(f"{key}: {error}")
+            stale = asset_keys([Unit("demonstrations")])
+        if stale:
+            requests.append(dg.RunRequest(run_key=run_key(key), partition_key=key, asset_selection=stale))
+    return requests
 
 
 def _weekly(config: Config, job: Any) -> dg.ScheduleDefinition:
@@ -72,11 +91,9 @@ def _weekly(config: Config, job: Any) -> dg.ScheduleDefinition:
         context: dg.ScheduleEvaluationContext, workbench: dg.ResourceParam[Workbench]
     ) -> Iterator[dg.RunRequest | dg.SkipReason]:
         ready = set(context.instance.get_dynamic_partitions(str(PARTITIONS.name)))
-        requests = [
-            dg.RunRequest(partition_key=key, asset_selection=stale)
-            for key in workbench.config.datasets
-            if key in ready and (stale := stale_assets(workbench, key))
-        ]
+        keys = [key for key in workbench.config.datasets if key in ready]
+        tick = context.scheduled_execution_time.strftime("%Y-%m-%dT%H:%MZ")
+        requests = requests_for(workbench, keys, context.log.warning, lambda key: f"{key}@{tick}")
         if requests:
             yield from requests
         else:
@@ -101,11 +118,7 @@ def _new_revision(job: Any) -> dg.SensorDefinition:
         found = {key: commit for key, commit in _commits(workbench.config) if key in ready and seen.get(key) != commit}
         if not found:
             return dg.SkipReason("no data set of the Hub has moved")
-        requests = [
-            dg.RunRequest(run_key=f"{key}@{commit}", partition_key=key, asset_selection=stale)
-            for key, commit in found.items()
-            if (stale := stale_assets(workbench, key))
-        ]
+        requests = requests_for(workbench, found, context.log.warning, lambda key: f"{key}@{found[key]}")
         return dg.SensorResult(run_requests=requests, cursor=json.dumps(seen | found))
 
     return new_hub_revision
@@ -137,3 +150,45 @@ def register_datasets(context: dg.SensorEvaluationContext, workbench: dg.Resourc
     if not missing:
         return dg.SensorResult(skip_reason=dg.SkipReason("every data set is a partition already"))
     return dg.SensorResult(dynamic_partitions_requests=[PARTITIONS.build_add_request(missing)])
+
+
+@dg.run_failure_sensor(
+    name="run_failed",
+    minimum_interval_seconds=30,
+    default_status=dg.DefaultSensorStatus.RUNNING,
+    description="Writes one line to automation.log in the results folder for every run that failed (data set, step, what was "
+    "wrong, how to see more), and tells whoever [notify] names.",
+)
+def run_failed(context: dg.RunFailureSensorContext, workbench: dg.ResourceParam[Workbench]) -> None:
+    """One line, one message."""
+    from pipeline.notify import log_line, message, send
+
+    run = context.dagster_run
+    dataset = run.tags.get("dagster/partition", "no data set")
+    words = failure_words([*context.get_step_failure_events(), context.failure_event])
+    log_line(
+        workbench.store.root,
+        f"{dataset} failed: {words} (run {run.run_id[:8]}; to see more: demobench ui, Runs, {run.run_id[:8]})",
+    )
+    send(workbench.config.notify, message("failure", dataset, words, run_id=run.run_id), workbench.store.root)
+
+
+def failure_words(events: Sequence[dg.DagsterEvent]) -> str:
+    """The step that failed and the first line of why: of the steps in their order the first that says, else of the run."""
+    for event in events:
+        error = getattr(event.event_specific_data, "error", None)
+        if event.step_key and error is not None:
+            return f"{event.step_key.replace('__', '/')}: {_first_line(error)}"
+    return next(iter((events[-1].message or "").splitlines()), "") or "for a reason that is in its log"
+
+
+def _first_line(error: Any) -> str:
+    """Of our own error in a chain of causes where there is one, else of the last cause, with its kind."""
+    ours = {name for name, cls in vars(errors).items() if isinstance(cls, type) and issubclass(cls, DemobenchError)}
+    while True:
+        kind, _, words = error.message.strip().partition(": ")
+        if kind.split(".")[-1] in ours:
+            return next(iter(words.splitlines()), "")
+        if error.cause is None:
+            return next(iter(error.message.strip().splitlines()), error.cls_name or "")
+        error = error.cause

@@ -2,9 +2,10 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import dagster as dg
 
@@ -12,28 +13,56 @@ from assets_defs.curve import KEY as CURVE
 from assets_defs.curve import read_kept
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
 from assets_defs.floor import ESTIMATES
+from assets_defs.history import PAGE, PICTURE, history_folder, record, with_champion
 from assets_defs.links import experiment_link, file_link
 from assets_defs.looking import VIDEO, driven_videos
 from assets_defs.plan import Unit
-from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
+from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result, warning_spec
 from assets_defs.show import interval_words, picture, present, table
 from pipeline.experiment import Variant
 from pipeline.methods import EXTERNAL
 
 if TYPE_CHECKING:
+    from pipeline.history import Line
     from pipeline.sinks.to_mlflow import Message
 
 TABLE = dg.AssetKey(["benchmark_table"])
 REPORT = dg.AssetKey(["benchmark_report"])
+REGRESSION = "champion_not_worse"
 
 
-def benchmark_assets(deps: Sequence[dg.AssetKey], floors: Sequence[dg.AssetsDefinition]) -> list[dg.AssetsDefinition]:
-    """The table and the page; `deps` are the predictions and roll-outs of every policy."""
-    benchmark_table = _benchmark_table(deps, floors)
+def benchmark_assets(
+    deps: Sequence[dg.AssetKey], floors: Sequence[dg.AssetsDefinition], cron: str
+) -> list[dg.AssetsDefinition]:
+    """The table and the page; `deps` are the predictions and roll-outs of every policy, `cron` when they are made by themselves."""
+    benchmark_table = _benchmark_table(deps, floors, cron)
     return [benchmark_table, _benchmark_report(benchmark_table)]
 
 
-def _benchmark_table(deps: Sequence[dg.AssetKey], floors: Sequence[dg.AssetsDefinition]) -> dg.AssetsDefinition:
+def gate_words(cron: str) -> str:
+    """What the regression gate asks, how often it is wrong, and what that means at a schedule."""
+    from pipeline.statistics.regression import FALSE_ALARMS_AT_MOST, FEWEST_SEEDS, MARGIN, POWER
+
+    runs = runs_a_year(cron)
+    return (
+        f"The champion, trained anew, is not worse than it was: paired by held-out episode, more than {100 * MARGIN:.0f} % beyond "
+        f"chance, on the same data with the same settings; needs {FEWEST_SEEDS} seeds. Where nothing changed it alarms in "
+        f"{100 * FALSE_ALARMS_AT_MOST:.1f} % of trainings or less (an upper limit over 400 pairs with fresh seeds and resampled "
+        f"episodes), and it sees an error that rose by a fifth in {100 * POWER:.0f} % or more (50 episodes). At the schedule "
+        f"'{cron}', {runs:,} times a year, that is at most {FALSE_ALARMS_AT_MOST * runs:.1f} false alarms a year and data set, and "
+        "fewer where most weeks change nothing. It stops nothing."
+    )
+
+
+def runs_a_year(cron: str) -> int:
+    """How often a schedule ticks in a year, on average over four."""
+    span = {"start": "2025-01-01 00:00", "end": "2029-01-01 00:00", "fmt": "%Y-%m-%d %H:%M"}
+    return round(dg.TimeWindowPartitionsDefinition(cron_schedule=cron, **span).get_num_partitions() / 4)
+
+
+def _benchmark_table(
+    deps: Sequence[dg.AssetKey], floors: Sequence[dg.AssetsDefinition], cron: str
+) -> dg.AssetsDefinition:
     @dg.asset(
         key=TABLE,
         partitions_def=PARTITIONS,
@@ -44,6 +73,7 @@ def _benchmark_table(deps: Sequence[dg.AssetKey], floors: Sequence[dg.AssetsDefi
         check_specs=[
             check_spec(TABLE, "baselines_present", "Hold-still is in the table: every error is read against it."),
             check_spec(TABLE, "same_data", "Every row was computed from the same demonstrations and split."),
+            warning_spec(TABLE, REGRESSION, gate_words(cron)),
         ],
     )
     def benchmark_table(
@@ -51,20 +81,29 @@ def _benchmark_table(deps: Sequence[dg.AssetKey], floors: Sequence[dg.AssetsDefi
     ) -> dg.MaterializeResult:
         """Policies and baselines side by side, on the same held-out episodes, with intervals over episodes.
 
-        It holds every result that is up to date, whichever run made it.
+        It holds every result that is up to date, whichever run made it. Each table is an entry of the history, from which
+        follows who the champion is, and whether it got worse (docs/automation.md).
         """
+        from pipeline.history import regression_words
+
         bench = workbench.open(context, budget)
         made = bench.make(Unit("benchmark_table"), lambda draft: _write_table(bench, draft))
+        line = record(bench, made, project_version(), context.run.run_id)
+        verdict = (not line.got_worse, regression_words(line))
+        made = replace(made, summary={**made.summary, "checks": {**made.summary["checks"], REGRESSION: verdict}})
         header = ["policy", "sees", "first-step MAE", "95 %", "× still", "success"]
         metadata = {
             "table": table(header, made.summary["rows"]),
             **_links(context, bench),
             "protocol": bench.experiment.protocol,
             "budget": bench.experiment.budget_words,
+            **_history_metadata(bench, line),
             # The UI plots numbers over time, and prints a longer name over the column beside it.
             **{f"mae_{row[0]}_{row[1]}": float(row[2]) for row in made.summary["rows"] if row[2] is not None},
         }
-        return result(bench, TABLE, {"": made}, metadata, ["baselines_present", "same_data"])
+        return result(
+            bench, TABLE, {"": made}, present(metadata), ["baselines_present", "same_data"], warnings=[REGRESSION]
+        )
 
     return benchmark_table
 
@@ -77,6 +116,20 @@ def _links(context: dg.AssetExecutionContext, bench: Bench) -> dict[str, dg.UrlM
     }
     context.instance.add_run_tags(context.run.run_id, {f"demobench/{name}": link for name, link in links.items()})
     return {name: dg.MetadataValue.url(link) for name, link in links.items()}
+
+
+def _history_metadata(bench: Bench, line: "Line") -> dict[str, Any]:
+    from pipeline.history import in_words
+
+    folder = history_folder(bench)
+    return {
+        "champion": line.champion,
+        "champion_from_now_on": line.next_champion if line.promotion else None,
+        "regression": (line.regression or {}).get("word"),
+        "champion_in_words": in_words(line),
+        "history": picture(folder / PICTURE),
+        "history_page": dg.MetadataValue.path(str(folder / PAGE)),
+    }
 
 
 def _write_table(bench: Bench, draft) -> Outcome:
@@ -108,7 +161,7 @@ def _write_table(bench: Bench, draft) -> Outcome:
     floors, estimates = load_floors(floor / "radius.json"), load_estimates(floor / ESTIMATES)
     facts = bench.summary(Unit("demonstrations"))["inspect"]
     modes = json.loads((plan.folder(Unit("action_modes")) / "modes.json").read_text(encoding="utf-8"))
-    built = build_table(facts, bench.experiment, bench.split, floors, estimates, entries, modes)
+    built = build_table(facts, with_champion(bench), bench.split, floors, estimates, entries, modes)
     built["key"] = plan.key
     write_json(draft / "table.json", built)
     rows = [

@@ -62,7 +62,7 @@ def build_defs(
         *branches,
         *curve_assets(predictions),
         *elsewhere_assets(),
-        *benchmark_assets([*predictions, *rollouts, SCORED], floor.ASSETS),
+        *benchmark_assets([*predictions, *rollouts, SCORED], floor.ASSETS, config.schedule.cron),
         *looking_assets([*predictions, SCORED], rollouts),
     ]
     return dg.Definitions(

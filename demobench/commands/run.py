@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
+from rich.markup import escape
 
 from demobench.commands.session import Session, open_session, program, short, tell_mlflow, write_json_to
 from pipeline.errors import ConfigError, StoreError
 from pipeline.experiment import Choices, Target, parse_chunks, parse_list, resolve_target, select_rows
 from pipeline.methods import METHODS, is_own
+from pipeline.store import Store
 
 if TYPE_CHECKING:
     from dagster import DagsterInstance, Definitions
@@ -73,6 +75,8 @@ def _run_one(target: Target, session: Session) -> tuple[dict[str, Any], "Policie
     plan = _plan(target, session)
     report = collect(target, plan, session)
     show(report, target, session)
+    if news := champion_news(store, target.key):
+        console.print(f"  [yellow]{escape(news)}[/]", soft_wrap=True)
     for unit in plan.scored_units():
         if not plan.is_fresh(unit):
             console.print(
@@ -81,6 +85,14 @@ def _run_one(target: Target, session: Session) -> tuple[dict[str, Any], "Policie
                 soft_wrap=True,
             )
     return report, failure
+
+
+def champion_news(store: Store, key: str) -> str | None:
+    """What the latest table says of the champion, where it got worse or another policy takes its place."""
+    from pipeline.history import in_words, read_history
+
+    lines = read_history(store, key)
+    return in_words(lines[-1]) if lines and (lines[-1].got_worse or lines[-1].promotion) else None
 
 
 def _plan(target: Target, session: Session) -> "Plan":

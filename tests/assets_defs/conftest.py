@@ -32,8 +32,9 @@ class TinyBenchmark:
 
     @property
     def config(self) -> Config:
-        said = self.raw.get("datasets", {}).get("tiny", {})
-        return parse_config({**self.raw, "datasets": {"tiny": {"source": str(self.folder), **said}}}, "test")
+        said = self.raw.get("datasets", {})
+        tiny = {"source": str(self.folder), **said.get("tiny", {})}
+        return parse_config({**self.raw, "datasets": {**said, "tiny": tiny}}, "test")
 
     def target(self, **choices) -> Target:
         return resolve_target("tiny", self.config, self.folder, Choices(**choices), self.store.experiments())

@@ -1,19 +1,29 @@
 """What runs by itself."""
 
+import json
+import re
+from datetime import UTC, datetime
+
 import dagster as dg
 import pytest
 from dagster._core.definitions.partitions.context import partition_loading_context
+from dagster._utils.schedules import schedule_execution_time_iterator
 
-from assets_defs.automation import register_datasets
+from assets_defs.automation import register_datasets, run_failed
+from assets_defs.benchmark import runs_a_year
 from assets_defs.definitions import build_defs
-from assets_defs.launch import open_instance
+from assets_defs.launch import open_instance, run_benchmark
 from assets_defs.resources import Workbench
 from pipeline.config import parse_config
 from pipeline.experiment import variants
+from pipeline.notify import LOG
+from pipeline.statistics.regression import FALSE_ALARMS_AT_MOST
 from pipeline.store import Store
 from tests.assets_defs.conftest import TINY, TinyBenchmark
 from tests.lerobot_format.hub_server import running_hub
 from tests.makers import tiny_recording, write_v3
+
+MONDAY = datetime(2026, 3, 2, 3, 0, tzinfo=UTC)
 
 
 @pytest.fixture
@@ -36,12 +46,13 @@ def test_the_sensor_makes_partitions_of_the_files_and_the_stores_data_sets(fresh
         assert "already" in register_datasets(context).skip_reason.skip_message
 
 
-def schedule_tick(benchmark: TinyBenchmark, instance: dg.DagsterInstance):
+def schedule_tick(benchmark: TinyBenchmark, instance: dg.DagsterInstance, at: datetime = MONDAY):
     defs = benchmark.defs()
     schedule = defs.resolve_schedule_def("weekly_rebenchmark")
     context = dg.build_schedule_context(
-        instance=instance, resources={"workbench": workbench(benchmark)}, repository_def=defs.get_repository_def()
-    )
+        instance=instance, resources={"workbench": workbench(benchmark)}, repository_def=defs.get_repository_def(),
+        scheduled_execution_time=at,
+    )  # fmt: skip
     return schedule.evaluate_tick(context)
 
 
@@ -113,3 +124,108 @@ def test_a_hub_out_of_reach_is_no_news(on_hub):
     hub, tick = on_hub
     hub.failure = 503
     assert "no data set of the Hub has moved" in tick(None).skip_message
+
+
+def test_a_data_set_that_is_gone_does_not_keep_the_others_from_their_runs(fresh, tmp_path):
+    fresh.raw = TINY | {"datasets": {"gone": {"source": str(tmp_path / "nowhere")}}}
+    with open_instance(fresh.store.root) as instance:
+        instance.add_dynamic_partitions("datasets", ["gone", "tiny"])
+        requests = {r.partition_key: r for r in schedule_tick(fresh, instance, MONDAY).run_requests}
+    assert set(requests) == {"gone", "tiny"}
+    assert requests["tiny"].run_key == "tiny@2026-03-02T03:00Z"
+    assert requests["gone"].asset_selection == [dg.AssetKey(["demonstrations"])], (
+        "its run says what is wrong, and stops"
+    )
+    assert len(requests["tiny"].asset_selection) > 10
+
+
+# When the clock says so ----------------------------------------------------------------------------------------------
+
+
+def test_the_schedule_ticks_on_mondays_at_three_utc_and_runs_what_is_stale_then(fresh):
+    with open_instance(fresh.store.root):
+        schedule = fresh.defs().resolve_schedule_def("weekly_rebenchmark")
+    since = datetime(2026, 2, 25, 12, 0, tzinfo=UTC)
+    ticks = schedule_execution_time_iterator(
+        since.timestamp(), schedule.cron_schedule, schedule.execution_timezone or "UTC"
+    )
+    assert [next(ticks).isoformat() for _ in range(3)] == [
+        "2026-03-02T03:00:00+00:00", "2026-03-09T03:00:00+00:00", "2026-03-16T03:00:00+00:00",
+    ]  # fmt: skip
+    with open_instance(fresh.store.root) as instance:
+        instance.add_dynamic_partitions("datasets", ["tiny"])
+        (request,) = schedule_tick(fresh, instance, MONDAY).run_requests
+    assert request.partition_key == "tiny"
+    assert request.tags["dagster/schedule_name"] == "weekly_rebenchmark"
+
+
+def test_another_time_is_a_setting(fresh):
+    fresh.raw = TINY | {"schedule": {"cron": "30 1 * * *"}}
+    with open_instance(fresh.store.root):
+        assert fresh.defs().resolve_schedule_def("weekly_rebenchmark").cron_schedule == "30 1 * * *"
+        specs = fresh.defs().resolve_assets_def(dg.AssetKey(["benchmark_table"])).check_specs
+    assert (runs_a_year("0 3 * * 1"), runs_a_year("30 1 * * *"), runs_a_year("0 3 1 * *")) == (52, 365, 12)
+    (gate,) = [spec for spec in specs if spec.name == "champion_not_worse"]
+    assert not gate.blocking
+    assert (
+        f"At the schedule '30 1 * * *', 365 times a year, that is at most {365 * FALSE_ALARMS_AT_MOST:.1f} false"
+        in (gate.description)
+    )
+
+
+# A run that fails ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def failed(tmp_path, monkeypatch):
+    """A benchmark whose data set cannot be read, its run, and a function that tells the sensor of it."""
+    secret = tmp_path / "hf_abcdefghijklmnop"
+    secret.mkdir()
+    (secret / "note.txt").write_text("not a data set")
+    told = tmp_path / "told.json"
+    command = ["/bin/sh", "-c", 'cat >> "$0"', str(told)]
+    benchmark = TinyBenchmark(secret, Store(tmp_path / "results").ensure(), TINY | {"notify": {"command": command}})
+    benchmark.store.register("tiny", benchmark.target().experiment.model_dump(mode="json"))
+    with open_instance(benchmark.store.root) as instance:
+        defs = benchmark.defs()
+        run = run_benchmark(instance, defs, "tiny", [dg.AssetKey(["demonstrations"])])
+        assert not run.is_success
+
+        def tell(said: TinyBenchmark = benchmark):
+            event = [entry.dagster_event for entry in instance.all_logs(run.run_id) if entry.is_dagster_event][-1]
+            context = dg.build_run_status_sensor_context(
+                "run_failed", event, instance, run, resources={"workbench": workbench(said)}
+            ).for_run_failure()
+            run_failed(context)
+
+        yield benchmark, run, tell, told
+
+
+def test_a_failed_run_is_one_line_and_one_message_without_a_token(failed):
+    benchmark, run, tell, told = failed
+    tell()
+    (line,) = (benchmark.store.root / LOG).read_text(encoding="utf-8").splitlines()
+    short = run.run_id[:8]
+    assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC tiny failed: demonstrations: ", line)
+    assert line.endswith(f"(run {short}; to see more: demobench ui, Runs, {short})")
+    assert "***" in line
+    assert "hf_abc" not in line
+    said = json.loads(told.read_text())
+    assert (said["event"], said["dataset"], said["run_id"]) == ("failure", "tiny", run.run_id)
+    assert said["words"] in line
+    assert "hf_abc" not in told.read_text()
+
+
+def test_nobody_who_can_be_told_is_one_more_line(failed, monkeypatch):
+    monkeypatch.setattr("pipeline.notify.PAUSE_S", 0.0)
+    benchmark, _, tell, _ = failed
+    benchmark.raw = benchmark.raw | {"notify": {"command": ["/nowhere/tell"]}}
+    tell(benchmark)
+    lines = (benchmark.store.root / LOG).read_text(encoding="utf-8").splitlines()
+    assert len(lines) == 2
+    assert "the command tell was not told of the failure of tiny: it cannot be started" in lines[1]
+
+
+def test_the_sensors_that_only_look_and_write_run_by_default(fresh):
+    running = {s.name for s in fresh.defs().sensors if s.default_status == dg.DefaultSensorStatus.RUNNING}
+    assert running == {"register_datasets", "run_failed"}
