@@ -111,14 +111,14 @@ class Outbox:
                     except _mlflow_errors() as error:
                         # What one run is refused must not hold back the others; a server that refuses two is ill.
                         refused.add(run)
-                        troubles.append(_words(error))
+                        troubles.append(_words(error).replace(self._uri, self.address))
                         if len(troubles) > 1 or not _answers(client):
                             break
                     else:
                         path.unlink()
                         sent += 1
         except _mlflow_errors() as error:
-            troubles.append(_words(error))
+            troubles.append(_words(error).replace(self._uri, self.address))
         with suppress(OSError):
             if troubles:
                 self._silent.write_text(troubles[0], encoding="utf-8")
@@ -163,11 +163,15 @@ def _mlflow_errors() -> tuple[type[Exception], ...]:
 
 
 def _words(error: Exception) -> str:
-    """What MLflow said, on one line; of a connection that failed only the last cause."""
-    root: BaseException = error
-    while root.__cause__ is not None or root.__context__ is not None:
-        root = root.__cause__ or root.__context__
-    words = (root.strerror or str(root)) if isinstance(root, OSError) else str(error)
+    """What MLflow said, on one line; of a connection that failed only the first cause."""
+    from requests import RequestException
+
+    root: BaseException | None = error
+    while root is not None and (not isinstance(root, OSError) or isinstance(root, RequestException)):
+        # A connection's own error may be no cause but one of what was raised about it.
+        inside = (about for about in root.args if isinstance(about, BaseException))
+        root = root.__cause__ or root.__context__ or next(inside, None)
+    words = str(error) if root is None else root.strerror or str(root)
     return printable(words.splitlines()[0] if words else type(error).__name__)[:300].rstrip(". ")
 
 
@@ -181,6 +185,7 @@ def _client(uri: str) -> Iterator[Any]:
     # Telemetry and its own progress prints have no place in somebody else's terminal.
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
+    os.environ.setdefault("MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT", "true")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", str(REQUEST_S))
     import logging
