@@ -18,7 +18,7 @@ from pipeline.config import parse_config
 from pipeline.experiment import variants
 from pipeline.notify import LOG
 from pipeline.statistics.regression import FALSE_ALARMS_AT_MOST
-from pipeline.store import Store
+from pipeline.store import Made, Store
 from tests.assets_defs.conftest import TINY, TinyBenchmark
 from tests.lerobot_format.hub_server import running_hub
 from tests.makers import tiny_recording, write_v3
@@ -128,6 +128,8 @@ def test_a_hub_out_of_reach_is_no_news(on_hub):
 
 def test_a_data_set_that_is_gone_does_not_keep_the_others_from_their_runs(fresh, tmp_path):
     fresh.raw = TINY | {"datasets": {"gone": {"source": str(tmp_path / "nowhere")}}}
+    with fresh.store.publish(fresh.store.folder("gone", "demonstrations")) as draft:  # it was there once
+        fresh.store.write_made(draft, Made("read then", summary={"asked": {}}))
     with open_instance(fresh.store.root) as instance:
         instance.add_dynamic_partitions("datasets", ["gone", "tiny"])
         requests = {r.partition_key: r for r in schedule_tick(fresh, instance, MONDAY).run_requests}
