@@ -72,7 +72,7 @@ def _send_chunks(
     anchors = one.anchors[inside]
     begin = arm.fingertips(demos.columns[STATE][anchors])[:, None]
     strips = np.concatenate([begin, arm.fingertips(one.actions[0, inside][:, ahead])], axis=1)
-    lines = rr.LineStrips3D.columns(strips=list(strips), colors=[colour] * len(strips), radii=[0.002] * len(strips))
+    lines = rr.LineStrips3D.columns(strips=list(strips), colors=[colour] * len(strips), radii=[0.0012] * len(strips))
     recording.send_columns(rr.new_entity_path(entity), _times(demos.timestamps[frames], anchors - frames.start), lines)
 
 

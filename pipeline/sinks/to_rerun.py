@@ -7,6 +7,7 @@
     /episode_007/camera/<camera>          the picture of each frame (`rerun_cameras`)
     /episode_007/path/…                   positions in a plane only: where it went, and the chunk predicted just now
     /episode_007/scene/…                  an arm that is known (`rerun_scenes`)
+    /episode_007/ahead/…                  joints elsewhere: the chunks predicted just now (`rerun_ahead`)
     /rollouts/…                           roll-outs (`rerun_rollouts`)
 
 What belongs here: entities, their looks, the blueprint, the viewer. What does not: choosing episodes, scores.
@@ -32,6 +33,7 @@ from pipeline.normalize import wrap
 from pipeline.simulate.recorded import Arm, arm_of
 from pipeline.sinks import replacing
 from pipeline.sinks.palette import BASELINES, INK, MUTED, is_baseline, policy_colours
+from pipeline.sinks.rerun_ahead import ahead_view, send_ahead, with_chunks
 from pipeline.sinks.rerun_cameras import Cameras, camera_entity
 from pipeline.sinks.rerun_rollouts import FRAME, TIME, Driven, rollouts_tab, send_rollouts
 from pipeline.sinks.rerun_scenes import arm_view, send_arm, send_things
@@ -101,11 +103,13 @@ def write_rerun(
             cameras.send(recording, root, episode, partial(_first_times, demos, frames))
             if has_paths(demos, semantics):
                 _send_paths(recording, demos, semantics, predictions, episode, looks)
+            else:
+                send_ahead(recording, root, demos, episode, predictions, [s.colour for s in looks])
             if arm:
                 send_arm(recording, f"{root}/scene", demos, episode, arm, predictions, [s.colour for s in looks])
         for one in driven:
             send_rollouts(recording, one)
-        recording.send_blueprint(_blueprint(demos, semantics, episodes, driven, cameras, arm))
+        recording.send_blueprint(_blueprint(demos, semantics, predictions, episodes, driven, cameras, arm))
         recording.flush()
         recording.disconnect()
     return cameras.left_out
@@ -278,7 +282,7 @@ def _send_error(recording, demos, semantics, predictions, episode, series, floor
     marked = np.where(errors >= np.array(largest), errors, np.nan)[:, learned]
     if np.isfinite(marked).any():
         looks = rr.SeriesPoints(
-            names=[f"{series[p].name}: its largest {DISAGREES:.0%}" for p in learned],
+            names=[f"◆ {series[p].name}" for p in learned],
             colors=[series[p].colour for p in learned],
             markers=["diamond"] * len(learned),
             marker_sizes=[4.0] * len(learned),
@@ -319,11 +323,11 @@ def _column_names(demos: Demonstrations) -> list[str]:
     return [name if names.count(name) == 1 else f"{name}_{place}" for place, name in enumerate(names)]
 
 
-def _blueprint(demos, semantics, episodes: Sequence[int], driven: Sequence[Driven], cameras: Cameras, arm) -> Any:
+def _blueprint(demos, semantics, predictions, episodes, driven: Sequence[Driven], cameras: Cameras, arm) -> Any:
     """A tab an episode: joints in a grid, the error below them, what there is to see beside them; then roll-outs."""
     import rerun.blueprint as rrb
 
-    tabs = [_tab(demos, semantics, episode, cameras, arm) for episode in episodes] + [
+    tabs = [_tab(demos, semantics, predictions, episode, cameras, arm) for episode in episodes] + [
         rollouts_tab(one) for one in driven
     ]
     return rrb.Blueprint(
@@ -334,11 +338,12 @@ def _blueprint(demos, semantics, episodes: Sequence[int], driven: Sequence[Drive
     )
 
 
-def _tab(demos: Demonstrations, semantics: Semantics, episode: int, cameras: Cameras, arm: Arm | None) -> Any:
+def _tab(demos, semantics, predictions, episode: int, cameras: Cameras, arm: Arm | None) -> Any:
     import rerun.blueprint as rrb
 
     root = episode_root(demos, episode)
-    plots = rrb.Vertical(rrb.Grid(*_joint_views(demos, root)), _error_view(demos, root, episode), row_shares=[2, 1])
+    joints = rrb.Grid(*_joint_views(demos, root))
+    plots = rrb.Vertical(joints, _error_view(demos, root, episode), row_shares=[2, 1]) if predictions else joints
     seen = [
         rrb.Spatial2DView(origin=camera_entity(root, camera), name=f"camera {camera.key}")
         for camera in cameras.shown(episode)
@@ -349,6 +354,8 @@ def _tab(demos: Demonstrations, semantics: Semantics, episode: int, cameras: Cam
         seen.append(rrb.Spatial2DView(origin=f"{root}/path", contents=contents, name="path and predicted chunks"))
     if arm:
         seen.append(arm_view(f"{root}/scene", arm))
+    if not has_paths(demos, semantics) and with_chunks(predictions):
+        seen.append(ahead_view(root, demos, predictions))
     title = f"episode {demos.episode_ids[episode]}"
     if not seen:
         return rrb.Vertical(plots, name=title)
@@ -366,7 +373,7 @@ def _joint_views(demos: Demonstrations, root: str) -> list[Any]:
         views.append(
             rrb.TimeSeriesView(
                 origin=rr.new_entity_path([root.strip("/"), "joints", entity]),
-                name=f"{title} · white: recorded",
+                name=title,
                 plot_legend=rrb.PlotLegend(visible=False),
             )
         )
@@ -379,6 +386,7 @@ def _error_view(demos: Demonstrations, root: str, episode: int) -> Any:
     import rerun.blueprint as rrb
 
     unit = common_unit(demos.features[ACTION].units)
+    title = f"mean |error| of the first action ({unit or 'unit unknown'})"
     end_s = float(demos.timestamps[demos.episode(episode)].max())
     room = rr.TimeRange(
         start=rr.TimeRangeBoundary.absolute(seconds=0.0),
@@ -386,7 +394,7 @@ def _error_view(demos: Demonstrations, root: str, episode: int) -> Any:
     )
     return rrb.TimeSeriesView(
         origin=f"{root}/error",
-        name=f"mean |error| of the first action ({unit or 'unit unknown'})",
+        name=f"{title} · ◆ a policy's largest {DISAGREES:.0%} · above, white: recorded",
         axis_x=rrb.archetypes.TimeAxis(view_range=room),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
     )

@@ -348,7 +348,7 @@ def test_diamonds_mark_the_largest_errors_of_trained_policies_over_all_they_were
     np.testing.assert_allclose(marked[12:15, 0], 105, atol=1e-3)
     assert "/episode_009/error/disagrees" not in entities
     static = [chunk for chunk in entities["/episode_008/error/disagrees"] if chunk.is_static]
-    assert column(static, "SeriesPoints:names") == [["mlp_k04: its largest 5%"]]
+    assert column(static, "SeriesPoints:names") == [["◆ mlp_k04"]]
 
 
 def test_an_so101_in_degrees_is_its_own_arm_and_one_in_other_units_is_not(tmp_path):
@@ -403,3 +403,22 @@ def test_real_recordings_with_their_cameras(tmp_path, shared_data, name):
         np.testing.assert_allclose(seconds, demos.timestamps[demos.episode(episode)], atol=1e-6)
         due = [nanos[0] for nanos in column(chunks, "VideoFrameReference:timestamp")]
         assert due == [due[0] + 100_000_000 * k for k in range(len(seconds))], "the camera's clock is even"
+
+
+def test_joints_have_the_chunk_ahead_of_the_cursor_beside_what_came(tmp_path):
+    demos = make_demos(columns=3, lengths=(30,))
+    one = make_predictions(demos, [0], chunk=4, off=0.0)
+    write_rerun(tmp_path / "a.rrd", demos, make_semantics(demos, "velocity"), [one], [0], name="a")
+    entities = read(tmp_path / "a.rrd")
+    recorded = column([c for c in entities["/episode_007/ahead/recorded"] if not c.is_static], "LineStrips2D:strips")
+    chunks = column([c for c in entities["/episode_007/ahead/mlp_k04/state"] if not c.is_static], "LineStrips2D:strips")
+    assert (len(recorded), len(chunks), len(recorded[0]), len(recorded[0][0])) == (30, 28, 3, 4)
+    np.testing.assert_allclose(chunks[:-3], recorded[2:-3], atol=1e-5)  # it predicts what then came, in every lane
+    action = demos.columns[ACTION]
+    lane = np.array([[line[0][1] for line in frame] for frame in recorded])
+    expected = np.arange(3) + 0.8 * (1 - (action - action.min(axis=0)) / np.ptp(action, axis=0))
+    np.testing.assert_allclose(lane, expected, atol=1e-5)
+    assert [len(line) for line in recorded[-1]] == [1, 1, 1]
+    names = column([c for c in entities["/episode_007/ahead/names"] if c.is_static], "Points2D:labels")
+    assert names == [["x (px)", "y (px)", "z (px)"]]
+    assert not [entity for entity in entities if "/path" in entity]
