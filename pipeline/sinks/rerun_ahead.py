@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.sinks.palette import GRID, INK, is_baseline
+from pipeline.sinks.palette import GRID, INK, MUTED, is_baseline
 from pipeline.sinks.rerun_rollouts import FRAME, TIME
 from pipeline.types import ACTION, Demonstrations, Predictions
 
@@ -115,7 +115,7 @@ def _send_names(recording: Any, root: str, demos: Demonstrations, lanes: _Lanes)
     recording.log(f"{root}/lanes", rr.LineStrips2D([*bottoms, now], colors=[GRID.rgb_on_dark], radii=-0.5), static=True)
     names = [f"{n} ({unit})" if unit else n for n, unit in zip(feature.names, feature.units, strict=True)]
     places = [[-0.16 * lanes.wide, y] for y in middles]
-    labels = rr.Points2D(places, labels=names, radii=-0.1, colors=[GRID.rgb_on_dark], show_labels=True)
+    labels = rr.Points2D(places, labels=names, radii=-0.1, colors=[MUTED.rgb_on_dark], show_labels=True)
     recording.log(f"{root}/names", labels, static=True)
 
 
