@@ -1,6 +1,7 @@
 # make demo    the whole benchmark on the two embedded data sets
 # make test    the tests; make test-slow the long ones
 # make ui      Dagster, MLflow and the reports on 127.0.0.1
+# make screenshots   the README's pictures, of STORE (default results)
 # make lerobot-env   LeRobot in an environment of its own, for the tests that need it
 
 PYTHON ?= python3
@@ -8,7 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo setup test test-slow ui speed lint clean lerobot-env
+.PHONY: demo setup test test-slow ui speed lint clean lerobot-env screenshots
 
 demo: $(READY)
 	$(BIN)/demobench run pusht_sim so101_sim
@@ -37,6 +38,11 @@ ui: $(READY)
 
 speed: $(READY)
 	$(BIN)/python -m speed
+
+STORE ?= results
+
+screenshots: $(READY)
+	$(BIN)/python -m docs.screenshots $(STORE)
 
 lint: $(READY)
 	$(BIN)/ruff format --check .

@@ -132,7 +132,10 @@ def window():
     complaints: list[str] = []
 
     def listen(page) -> None:
-        page.on("console", lambda said: complaints.append(said.text) if said.type == "error" else None)
+        page.on(
+            "console",
+            lambda said: complaints.append(f"{said.text} {said.location['url']}") if said.type == "error" else None,
+        )
         page.on("pageerror", lambda error: complaints.append(str(error)))
 
     with sync_playwright() as play:
@@ -174,14 +177,15 @@ def test_a_whole_graph_is_made_from_the_ui_and_leads_to_its_report_and_to_mlflow
     with page.expect_popup() as opened:
         page.get_by_role("link", name=f"{mlflow}/#/runs/").first.click()
     opened.value.get_by_text("mlp_k01/state").first.wait_for()
-    assert not complaints
+    # MLflow's page asks its own server who is logged in, which a server without users does not know.
+    assert not [said for said in complaints if not said.endswith("/ajax-api/2.0/mlflow/users/current")]
 
 
 def launch(page, dagster: str, partition: str) -> None:
     """Start the job `benchmark` for one data set with the mouse, as people do."""
     page.goto(f"{dagster}/locations/demobench/jobs/benchmark")
     page.get_by_role("button", name="Materialize all").first.click()
-    page.get_by_role("button", name="Confirm").click()  # "upstream assets have not been materialized yet": see docs
+    page.get_by_role("button", name="Confirm").click()  # what must be named (learning_curve, …) is not there
     page.get_by_text("Select a partition or create one").first.click()
     page.get_by_text(partition, exact=True).locator("visible=true").last.click()
     page.get_by_text("Launch runs to materialize").click()  # closes the list
