@@ -225,7 +225,10 @@ function fitted(spec, width) {
 }
 for (const place of document.querySelectorAll("[data-chart]")) {
   const spec = charts[Number(place.dataset.chart)];
-  vegaEmbed(place, fitted(spec, place.clientWidth), options).catch((error) => {
+  vegaEmbed(place, fitted(spec, place.clientWidth), options).then(() => {
+    // The place is one picture with one description; marks inside that call themselves pictures would need theirs.
+    place.querySelector("svg").setAttribute("aria-hidden", "true");
+  }).catch((error) => {
     place.classList.add("failed");
     place.textContent = "This picture could not be drawn: " + error.message;
   });
