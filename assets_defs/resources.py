@@ -252,7 +252,7 @@ def result(
     """
     version = hash_of({entry: m.fingerprint for entry, m in made.items()})
     costs = {
-        "seconds": dg.MetadataValue.float(sum(m.seconds for m in made.values())),
+        "seconds": dg.MetadataValue.float(sum((m.seconds for m in made.values()), 0.0)),
         "peak_memory_mb": dg.MetadataValue.float(max((m.peak_memory_mb for m in made.values()), default=0.0)),
         "stored_in": dg.MetadataValue.path(str(bench.store.dataset(bench.plan.key))),
     }

@@ -108,7 +108,7 @@ def test_the_time_there_is_for_a_call_is_that_of_the_actions_carried_out(table):
     period = 1e3 / table["dataset"]["fps"]
     late = {name: (row["deadline_ms"], row["misses_deadline"]) for name, row in rows.items()}
     assert late == {"mlp_k01": (period, period < 900), "mlp_k32": (8 * period, False), "hold_still": (None, None)}
-    assert rows["mlp_k32"]["execution"] == {"execute": 8, "ensemble": False, "delay": 0}
+    assert rows["mlp_k32"]["execution"] == {"execute": 8, "ensemble": False, "delay": 0, "carry_on": False}
     assert rows["hold_still"]["latency_p99_ms"] == 0.3
 
 

@@ -5,7 +5,6 @@ tests. Nothing here calls one policy better than another unless a comparison of 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 from pipeline.execution import settled
@@ -147,7 +146,7 @@ def driven_words(table: Table) -> list[str]:
     found = []
     for row in (row for row in table["policies"] if row["rollouts"]):
         how = row["rollouts"].get("execution")
-        if how and how != asdict(settled(AS_USUAL, row["chunk"] or 1)):
+        if how and Execution(**how) != settled(AS_USUAL, row["chunk"] or 1):
             found.append(f"roll-outs of {name_in(table, address(row))}: {execution_words(Execution(**how))}")
     reasons: dict[str, list[str]] = {}
     for row in table["policies"]:

@@ -147,7 +147,7 @@ def test_every_key_of_a_policy_reaches_its_training_and_its_roll_outs(session):
     assert (policy.transform.history, policy.transform.relative.tolist()) == (2, [True, True])
     assert policy.transform.derived[0] == "pusht_block_frame"
     assert json.loads((one.folder / "fold_0/training.json").read_text())["steps"][-1] == 2
-    rolled = roll_out(one.task, one.folder)
+    (rolled,) = roll_out(one.task, one.folder)
     assert (rolled.execution, len(rolled.success)) == (Execution(2, delay=1), 2)
 
 
