@@ -58,3 +58,16 @@ def test_another_budget_in_the_launchpad_is_the_command_lines_variant(finished):
     assert finished.store.experiments()[opened.plan.key]["seeds"] == 1
     with pytest.raises(ConfigError, match="no observation set 'stat'"):
         workbench.open(context, Budget(observations=["stat"]))
+
+
+def test_a_run_says_who_makes_it_and_where_its_results_are_seen(finished):
+    with open_instance(finished.store.root) as instance:
+        run = next(run for run in instance.get_runs() if "demobench/report" in run.tags)
+        table = instance.get_latest_materialization_event(dg.AssetKey(["benchmark_table"])).asset_materialization
+    assert run.tags[PID_TAG] == str(os.getpid())
+    assert run.tags["demobench/report"] == "http://127.0.0.1:3001/tiny/benchmark_report/report.html"
+    assert run.tags["demobench/mlflow"].startswith("http://127.0.0.1:5000/#/experiments/")
+    assert run.tags["demobench/mlflow"].endswith("/runs")
+    assert {name: table.metadata[name].value for name in ("report", "mlflow")} == {
+        name: run.tags[f"demobench/{name}"] for name in ("report", "mlflow")
+    }
