@@ -87,7 +87,8 @@ def test_the_example_of_policies_is_a_configuration():
     text = (ROOT / "docs" / "policies.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
     recipe = config.parse_config(tomllib.loads(block), "docs/policies.md").policies["recipe"]
-    assert set(recipe.given) == {"history", "actions", "features", "symmetry", "cpu_seconds"}
+    expected = {"history", "actions", "features", "symmetry", "noise", "hindsight", "cpu_seconds"}
+    assert set(recipe.given) == expected
 
 
 def test_the_readme_names_its_two_commands():

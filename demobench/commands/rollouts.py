@@ -110,6 +110,10 @@ def _bar(console: Console, what: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bars.update(task, completed=done, total=total)
 
 
+def _executed(how: Mapping[str, Any]) -> str:
+    return "ensemble" if how["ensemble"] else f"{how['execute']}{', on' if how['carry_on'] else ''}"
+
+
 def _how(execution: Execution) -> str:
     how = "ensemble" if execution.ensemble else f"{execution.execute} executed"
     return f"{how}, delay {execution.delay}{', carried on' if execution.carry_on else ''}"
@@ -135,7 +139,7 @@ def _show(
         interval = row["success_interval"]
         how, size = row["execution"], row["mean_intervention"]
         table.add_row(
-            escape(row["policy"]), str(row["chunk"]), "ensemble" if how["ensemble"] else str(how["execute"]),
+            escape(row["policy"]), str(row["chunk"]), _executed(how),
             str(how["delay"]), f"[bold]{row['successes']}/{row['episodes']}[/]",
             f"{100 * interval[0]:.0f}–{100 * interval[1]:.0f} %" if interval else "—",
             f"{row['score']:.3f}", percent(row["intervened"]), "—" if size is None else percent(size), str(row["stopped"]),
@@ -150,6 +154,7 @@ def _show(
     console.print(
         f"Stepped in: the share of frames in which the safety layer changed an action by more than {percent(TOLERANCE)} of a "
         "column's range; by: how far on average, in ranges; stopped: episodes that it ended.\n"
+        f"{'“on”: an answer goes on where the robot has not moved. ' if any(row['execution']['carry_on'] for row in rows) else ''}"
         f"Intervals ({_intervals(rows[0])}) are of each row alone: the best of many is partly luck. Roll it out again from "
         "start states that chose nothing (--from).",
         style="dim",

@@ -108,6 +108,9 @@ def test_carried_on_stands_beside_not_carried_on(session, tmp_path):
     roll("tiny/mlp_k04/pose", execute="2", carry_on=True, json_to=str(said))
     ways = [(row["execution"]["execute"], row["execution"]["carry_on"]) for row in json.loads(said.read_text())["rows"]]
     assert ways == [(2, False), (2, True)]
+    shown = session.console.export_text()
+    assert "2, on" in shown
+    assert "“on”: an answer goes on where the robot has not moved." in shown
 
 
 def test_left_alone_it_is_as_the_configuration_says(session, made, tmp_path):
