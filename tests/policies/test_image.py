@@ -33,9 +33,8 @@ def write_square(path, centres) -> None:
         container.mux(stream.encode())
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Episodes in which the action is where the square is, and the state says nothing."""
+def film(place):
+    """A data set in which the action is where the square is, and the state says nothing."""
     generator = np.random.default_rng(0)
     centres = generator.uniform(size=(EPISODES, FRAMES, 2))
     flat = centres.reshape(-1, 2).astype(np.float32)
@@ -44,7 +43,7 @@ def folder(tmp_path_factory):
         ACTION: (("x", "y"), flat, "float32"),
     }
     recording = Recording(10.0, features, (FRAMES,) * EPISODES, ("push",) * EPISODES)
-    folder = write_v2(tmp_path_factory.mktemp("filmed") / "set", recording)
+    folder = write_v2(place / "set", recording)
     declared = {"dtype": "video", "shape": [PIXELS, PIXELS, 3], "names": ["height", "width", "channels"]}
     edit_info(folder, lambda info: info["features"].update({KEY: declared}))
     path = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
@@ -52,6 +51,11 @@ def folder(tmp_path_factory):
     for episode in range(EPISODES):
         write_square(folder / f"videos/chunk-000/{KEY}/episode_{episode:06d}.mp4", centres[episode])
     return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return film(tmp_path_factory.mktemp("filmed"))
 
 
 def lay(demos, episodes=range(EPISODES), chunk=1):
