@@ -58,8 +58,9 @@ def automation(config: Config, policies: Sequence[Variant]) -> dict[str, list[An
 
 def stale_assets(workbench: Workbench, key: str) -> list[dg.AssetKey]:
     """The assets of a partition that have work to do, as keys; policies that must be named are left out."""
-    by_itself = tuple(v.name for v in workbench.variants if not v.only_when_named)
-    plan = Plan(workbench.store, key, workbench.experiment(key), workbench.variants, by_itself)
+    experiment = workbench.experiment(key)
+    variants = workbench.variants_of(experiment)
+    plan = Plan(workbench.store, key, experiment, variants, tuple(v.name for v in variants if not v.only_when_named))
     return asset_keys(plan.stale())
 
 

@@ -185,7 +185,7 @@ def windows(
         from pipeline.folds import describe_windows
 
         longest = int(bench.demonstrations.lengths.max()) - bench.experiment.history + 1
-        variants = [v for v in workbench.variants if budget.asks_for(v) or (v.chunk or 1) <= longest]
+        variants = [v for v in bench.plan.variants if budget.asks_for(v) or (v.chunk or 1) <= longest]
         described = describe_windows(bench.demonstrations, bench.semantics, bench.split, bench.experiment, variants)
         (draft / "windows.json").write_text(json.dumps(described, indent=1))
         rows = described["windows"]

@@ -199,6 +199,7 @@ class PolicyConfig(Settings):
     method: str
     chunks: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = ()
     observations: Literal["all"] | tuple[str, ...] = "all"
+    datasets: Literal["all"] | tuple[str, ...] = "all"
     only_when_named: bool = False
     history: Annotated[int, Field(ge=1, le=1000)] | None = None
     actions: Literal["absolute", "relative"] = "absolute"
@@ -214,6 +215,7 @@ class PolicyConfig(Settings):
 
     optional = frozenset(
         {
+            "datasets",
             "history",
             "actions",
             "features",
@@ -227,6 +229,10 @@ class PolicyConfig(Settings):
             "carry_on",
         }
     )
+
+    def is_for(self, dataset: str) -> bool:
+        """Whether a data set's benchmark has this policy."""
+        return self.datasets == "all" or dataset in self.datasets
 
     @property
     def given(self) -> dict[str, Any]:
@@ -295,10 +301,6 @@ BASELINES = {
 }
 """Always in a benchmark; a file need not name them."""
 
-DEFAULT_POLICIES = {
-    "mlp": PolicyConfig(method="mlp", chunks=(1, 4, 16, 32)),
-    "notebook_pusht": PolicyConfig(method="notebook_pusht", only_when_named=True),
-}
 PUSHT_SIM = DatasetConfig(
     source="embedded:pusht_sim",
     simulator="pusht",
@@ -327,6 +329,35 @@ SO101_SIM = DatasetConfig(
     },
 )
 
+EMBEDDED = {"pusht_sim": PUSHT_SIM, "so101_sim": SO101_SIM}
+DEFAULT_POLICIES = {
+    "mlp": PolicyConfig(method="mlp", chunks=(1, 4, 16, 32)),
+    "recipe": PolicyConfig(
+        method="mlp",
+        datasets=("so101_sim",),
+        observations=("pose",),
+        chunks=(32,),
+        actions="relative",
+        features="so101_hand_frame",
+        augment=AugmentConfig(
+            symmetry="so101_pan",
+            noise={"deg": 0.1, "%": 0.1, "m": 0.0005},
+            offset={"deg": 2, "m": 0.001},
+        ),
+        settings={
+            "blocks": 4,
+            "warmup": 100,
+            "cosine": True,
+            "clip": 1.0,
+            "ema": True,
+            "bf16": True,
+            "dropout": 0.1,
+        },
+        execute=16,
+    ),
+    "notebook_pusht": PolicyConfig(method="notebook_pusht", only_when_named=True),
+}
+
 
 class Config(Settings):
     """The whole file. What a file leaves out has the defaults of the `demobench.toml` that ships with the project."""
@@ -334,7 +365,7 @@ class Config(Settings):
     store: StoreConfig = StoreConfig()
     tracking: TrackingConfig = TrackingConfig()
     benchmark: BenchmarkConfig = BenchmarkConfig()
-    datasets: dict[str, DatasetConfig] = {"pusht_sim": PUSHT_SIM, "so101_sim": SO101_SIM}
+    datasets: dict[str, DatasetConfig] = EMBEDDED
     policies: dict[str, PolicyConfig] = DEFAULT_POLICIES
     schedule: ScheduleConfig = ScheduleConfig()
     notify: NotifyConfig = NotifyConfig()
@@ -390,18 +421,29 @@ def parse_config(raw: dict[str, Any], where: str) -> Config:
                 f"{where}: [policies.{name}] method '{policy.method}' does not exist. {did_you_mean(policy.method, METHODS)} "
                 'A class of your own is named by its file or module: method = "my_policy.py:MyPolicy".'
             )
-        sets = {"state", *(s for dataset in config.datasets.values() for s in dataset.observations)}
-        for named in () if policy.observations == "all" else policy.observations:
-            if named not in sets:
-                raise ConfigError(
-                    f"{where}: [policies.{name}] sees the observation set '{named}', which no data set has. "
-                    f"{did_you_mean(named, sets)}"
-                )
+        _check_reach(policy, config, f"{where}: [policies.{name}]")
         try:
             check_policy(policy)
         except ConfigError as error:
             raise ConfigError(f"{where}: [policies.{name}] {error}") from None
     return config
+
+
+def _check_reach(policy: PolicyConfig, config: Config, who: str) -> None:
+    """A policy names data sets that there are (those that ship are always there), and observation sets that they have."""
+    there_are = EMBEDDED | config.datasets
+    wanted = config.datasets if policy.datasets == "all" else policy.datasets
+    for named in wanted:
+        if named not in there_are:
+            raise ConfigError(
+                f"{who} is for the data set '{named}', which is not in [datasets]. {did_you_mean(named, there_are)}"
+            )
+    sets = {"state", *(s for named in wanted for s in there_are[named].observations)}
+    for named in () if policy.observations == "all" else policy.observations:
+        if named not in sets:
+            raise ConfigError(
+                f"{who} sees the observation set '{named}', which none of its data sets has. {did_you_mean(named, sets)}"
+            )
 
 
 def check_policy(policy: PolicyConfig) -> None:

@@ -136,13 +136,15 @@ class Experiment(Settings):
                 raise ConfigError(f"The data set '{self.name}' has no observation set '{name}'. {known}")
 
     def sets_of(self, variant: Variant) -> list[ObservationSet]:
-        """The observation sets a policy is asked with on this data set.
+        """The observation sets a policy is asked with on this data set; none if it is not for this data set.
 
         A method whose answer does not depend on the set runs once, under the first set that holds the arm's own state.
         """
         if not METHODS[variant.method].uses_observations:
             with_state = [s for s in self.observation_sets if "observation.state" in s.features]
             return (with_state or self.observation_sets)[:1]
+        if variant.family not in self.policies:
+            return []
         wanted = self.policies[variant.family].observations
         return [s for s in self.observation_sets if wanted == "all" or s.name in wanted]
 
@@ -198,7 +200,8 @@ def _experiment(config: Config, name: str, dataset: DatasetConfig, config_dir: P
     made = Experiment(
         name=name,
         dataset=_absolute_dataset(dataset, config_dir),
-        policies=dict(BASELINES) | {name: _absolute_method(p, config_dir) for name, p in config.policies.items()},
+        policies=dict(BASELINES)
+        | {family: _policy_here(p, config_dir) for family, p in config.policies.items() if p.is_for(name)},
         protocol=benchmark.protocol,
         history=benchmark.history,
         seeds=benchmark.seeds,
@@ -244,12 +247,14 @@ def _absolute_dataset(dataset: DatasetConfig, config_dir: Path) -> DatasetConfig
     return dataset.model_copy(update=update)
 
 
-def _absolute_method(policy: PolicyConfig, config_dir: Path) -> PolicyConfig:
-    """The files of a class and of derived features of the user's own, made absolute likewise."""
+def _policy_here(policy: PolicyConfig, config_dir: Path) -> PolicyConfig:
+    """A policy as an experiment keeps it: files of a class and of derived features of the user's own are absolute, likewise;
+    which other data sets have it changes nothing here."""
     named = {"method": policy.method, "features": policy.features}
     files = {key: name for key, name in named.items() if name is not None and is_own(name) and ".py:" in name}
-    update = {key: str((config_dir / Path(name).expanduser()).resolve()) for key, name in files.items()}
-    return policy.model_copy(update=update) if update else policy
+    update: dict[str, Any] = {"datasets": "all"}
+    update |= {key: str((config_dir / Path(name).expanduser()).resolve()) for key, name in files.items()}
+    return policy.model_copy(update=update)
 
 
 NO_BUDGET = {"steps": None, "cpu_seconds": None}
@@ -388,19 +393,36 @@ def with_choices(base: Experiment, choices: Choices) -> Experiment:
         if name not in policies and name in METHODS:
             chunks = (choices.chunks or (1, 16)) if METHODS[name].chunk == "set" else ()
             policies[name] = PolicyConfig(method=name, chunks=chunks)
-    for family, policy in policies.items():
-        extra = set(choices.chunks) - set(policy.chunks)
-        named = not choices.policies or family in choices.policies
-        if extra and named and METHODS[policy.method].chunk == "set":
-            chunks = tuple(sorted(set(policy.chunks) | extra))
-            policies[family] = policy.model_copy(update={"chunks": chunks})
-            try:
-                check_policy(policies[family])
-            except ConfigError as error:
-                raise ConfigError(f"[policies.{family}] {error}") from None
+    policies |= _with_chunks(policies, choices)
     if policies != base.policies:
         updates["policies"] = policies
     return base.model_copy(update=updates)
+
+
+def _with_chunks(policies: Mapping[str, PolicyConfig], choices: Choices) -> dict[str, PolicyConfig]:
+    """The policies that chunk sizes which none of them has are added to: all that can carry such chunks out.
+
+    Raises:
+        ConfigError: none can, or one that was asked for by name cannot.
+    """
+    families = {
+        family: policy
+        for family, policy in policies.items()
+        if METHODS[policy.method].chunk == "set" and (not choices.policies or family in choices.policies)
+    }
+    extra = set(choices.chunks) - {chunk for policy in families.values() for chunk in policy.chunks}
+    longer, refused = {}, []
+    for family, policy in families.items() if extra else ():
+        asked = policy.model_copy(update={"chunks": tuple(sorted(extra.union(policy.chunks)))})
+        try:
+            check_policy(asked)
+        except ConfigError as error:
+            refused.append(ConfigError(f"[policies.{family}] {error}"))
+        else:
+            longer[family] = asked
+    if refused and (choices.policies or not longer):
+        raise refused[0]
+    return longer
 
 
 def _select(experiment: Experiment, choices: Choices) -> list[Variant]:

@@ -70,6 +70,18 @@ def test_every_experiment_of_the_docs_is_read(file):
             {"policies": {"mlp": {"method": "mlp", "chunks": [1], "observations": ["stat"]}}},
             ["[policies.mlp] sees the observation set 'stat'", "Did you mean 'state'"],
         ),
+        (
+            {"policies": {"mlp": {"method": "mlp", "chunks": [1], "datasets": ["so100_sim"]}}},
+            ["[policies.mlp] is for the data set 'so100_sim'", "Did you mean 'so101_sim'"],
+        ),
+        (
+            {
+                "policies": {
+                    "mlp": {"method": "mlp", "chunks": [1], "datasets": ["so101_sim"], "observations": ["position"]}
+                }
+            },
+            ["[policies.mlp] sees the observation set 'position', which none of its data sets has"],
+        ),
     ],
 )
 def test_mistakes_are_named(raw, words):

@@ -65,6 +65,46 @@ def test_a_chunk_that_the_file_lacks_makes_a_variant_the_ui_cannot_run():
     assert "mlp_k08" in {v.name for v in found.selected}
 
 
+TWO = {
+    "datasets": {"tape": {"source": "tape"}, "other": {"source": "other"}},
+    "policies": {
+        "mlp": {"method": "mlp", "chunks": [1, 16]},
+        "long": {"method": "mlp", "chunks": [32], "execute": 16},
+        "theirs": {"method": "mlp", "chunks": [4], "datasets": ["other"]},
+    },
+}
+
+
+def of_two(dataset, **choices):
+    return resolve_target(dataset, parse_config(TWO, "test"), HERE, Choices(**choices), {})
+
+
+def test_chunk_sizes_that_the_file_has_select_and_others_go_to_every_policy_that_can_carry_them_out():
+    found = of_two("tape", chunks=(1, 16))
+    assert found.key == "tape"
+    assert {v.name for v in found.selected if v.is_trained} == {"mlp_k01", "mlp_k16"}
+    assert {v.name for v in of_two("tape", chunks=(8,)).selected if v.is_trained} == {"mlp_k08"}
+    assert {v.name for v in of_two("tape", chunks=(24,)).selected if v.is_trained} == {"mlp_k24", "long_k24"}
+    with pytest.raises(ConfigError, match=r"\[policies.long\] execute = 16"):
+        of_two("tape", chunks=(8,), policies=("mlp", "long"))
+
+
+def test_a_policy_made_for_one_data_set_is_in_no_other_and_changes_nothing_there():
+    assert "theirs_k04" in {v.name for v in of_two("other").selected}
+    mine = of_two("tape").experiment
+    assert "theirs_k04" not in {v.name for v in mine.variants}
+    without = {name: policy for name, policy in TWO["policies"].items() if name != "theirs"}
+    plain = resolve_target("tape", parse_config(TWO | {"policies": without}, "test"), HERE, Choices(), {}).experiment
+    assert mine == plain
+    without["theirs"] = {"method": "mlp", "chunks": [4]}
+    plain = resolve_target("other", parse_config(TWO | {"policies": without}, "test"), HERE, Choices(), {}).experiment
+    assert of_two("other").experiment == plain
+    (theirs,) = (v for v in of_two("other").experiment.variants if v.family == "theirs")
+    assert mine.sets_of(theirs) == []
+    with pytest.raises(ConfigError, match="No policy 'theirs'"):
+        of_two("tape", policies=("theirs",))
+
+
 def test_unknown_words_are_answered_with_the_nearest():
     with pytest.raises(ConfigError, match="Did you mean 'tape'"):
         target("tapes")
@@ -101,7 +141,7 @@ def test_hub_addresses_are_data_sets():
 
 def test_chunks_are_zero_padded_and_wrong_chunks_refused():
     names = [v.name for v in variants(Config().policies)]
-    assert names == ["mlp_k01", "mlp_k04", "mlp_k16", "mlp_k32", "notebook_pusht"]
+    assert names == ["mlp_k01", "mlp_k04", "mlp_k16", "mlp_k32", "recipe_k32", "notebook_pusht"]
     with pytest.raises(ConfigError, match="needs chunk sizes"):
         variants(parse_config({"policies": {"mlp": {"method": "mlp"}}}, "t").policies)
     with pytest.raises(ConfigError, match="takes none"):

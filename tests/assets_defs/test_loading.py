@@ -21,8 +21,8 @@ HEAVY = ("torch", "mlflow", "rerun", "pandas", "scipy.stats", "pyarrow", "altair
 def test_definitions_load_without_heavy_modules(tmp_path):
     out = subprocess.run([sys.executable, "-c", LOADED], cwd=tmp_path, capture_output=True, text=True, check=True)
     loaded = json.loads(out.stdout)
-    assert loaded["assets"] == 6 + 3 * 9 + 6, (
-        "the built-in configuration: four baselines, four chunk sizes, one by name"
+    assert loaded["assets"] == 6 + 3 * 10 + 6, (
+        "the built-in configuration: four baselines, four chunk sizes, a recipe, one by name"
     )
     assert not set(HEAVY) & set(loaded["modules"])
 
