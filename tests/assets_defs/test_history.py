@@ -1,0 +1,116 @@
+"""Tables that are made one after another: the history, the champion and the gate, in Dagster and in the store."""
+
+import json
+
+import dagster as dg
+import pytest
+
+from assets_defs.launch import open_instance, run_benchmark
+from assets_defs.plan import SUMMARIES, Unit
+from assets_defs.resources import asset_keys
+from pipeline.history import read_history
+from pipeline.notify import LOG
+from pipeline.store import Store
+from tests.assets_defs.conftest import TinyBenchmark, why_failed
+from tests.makers import tiny_recording, write_v3
+
+pytestmark = pytest.mark.slow
+
+LATER = tuple(Unit(asset) for asset in SUMMARIES if asset != "benchmark_table")
+"""What is made from the table, which is not looked at here."""
+
+POLICY = """
+class Mine:
+    '''The state goes half of the way to its command in every frame: so goes on what was commanded; `off` beside it.'''
+
+    def __init__(self, off=0.0):
+        self.off = off
+
+    def fit(self, observations, actions, mask, seed):
+        self.luck = 0.002 * seed
+
+    def predict(self, observations):
+        before, now = observations[:, -2], observations[:, -1]
+        return (2 * now - before + self.off + self.luck)[:, None]
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A benchmark whose champion is a baseline, and a function that makes the next table, of a policy that is so far off."""
+    folder = write_v3(tmp_path_factory.mktemp("data") / "tiny", tiny_recording(episodes=12, frames=30))
+    home = tmp_path_factory.mktemp("history")
+    (home / "mine.py").write_text(POLICY)
+    told = home / "told"
+    benchmark = TinyBenchmark(folder, Store(home / "results").ensure(), {
+        "benchmark": {"seeds": 2, "folds": 2, "steps": 1, "threads": 1},
+        "datasets": {"tiny": {"champion": "mean_action"}},
+        "notify": {"command": ["/bin/sh", "-c", 'cat >> "$0"; echo >> "$0"', str(told)]},
+    })  # fmt: skip
+
+    def run(off: float, seeds: int = 2) -> tuple[dict, dict, list[dict]]:
+        """The table's metadata, the gate's check, and what was told."""
+        told.unlink(missing_ok=True)
+        mine = {"method": f"{home / 'mine.py'}:Mine", "chunks": [1], "settings": {"off": off}}
+        benchmark.raw |= {"policies": {"mine": mine}, "benchmark": benchmark.raw["benchmark"] | {"seeds": seeds}}
+        benchmark.store.register("tiny", benchmark.target().experiment.model_dump(mode="json"))
+        up_to_the_table = [unit for unit in benchmark.plan().stale() if unit not in LATER]
+        with open_instance(benchmark.store.root) as instance:
+            done = run_benchmark(instance, benchmark.defs(), "tiny", asset_keys(up_to_the_table))
+            assert done.is_success, why_failed(instance, done)
+            event = instance.get_latest_materialization_event(dg.AssetKey(["benchmark_table"]))
+            metadata = {name: value.value for name, value in event.asset_materialization.metadata.items()}
+            key = dg.AssetCheckKey(dg.AssetKey(["benchmark_table"]), "champion_not_worse")
+            record = instance.event_log_storage.get_latest_asset_check_execution_by_key([key])[key]
+            check = record.event.dagster_event.asset_check_evaluation_data
+        said = [json.loads(line) for line in told.read_text().splitlines()] if told.exists() else []
+        return metadata, {"passed": check.passed, "why": check.metadata["why"].value}, said
+
+    return benchmark, run
+
+
+def test_the_champion_is_promoted_watched_and_told_of(made):
+    benchmark, run = made
+    # The first table: what is better than the champion that was named takes its place, from the next table on.
+    metadata, check, told = run(0.0)
+    assert (metadata["champion"], metadata["champion_from_now_on"]) == ("mean_action/state", "mine_k01/state")
+    assert check == {"passed": True, "why": "There is no earlier result of it to compare with."}
+    assert [(t["event"], t["dataset"]) for t in told] == [("new champion", "tiny")]
+    assert told[0]["words"].startswith(
+        "From the next table on the champion is mine_k01/state: better than mean_action/state"
+    )
+    assert told[0]["numbers"]["difference"] < 0
+    assert set(benchmark.plan().stale()) == set(LATER), "a promotion makes no table stale"
+    assert "data:image/png;base64" in metadata["history"]
+
+    # The second: the new champion is what rows are compared with, and it got worse.
+    metadata, check, told = run(0.3)
+    assert metadata["champion"] == "mine_k01/state"
+    assert metadata["regression"] == "worse"
+    assert not check["passed"]
+    assert check["why"].startswith("It got worse than the result of 20")
+    assert [t["event"] for t in told] == ["regression"]
+    assert told[0]["numbers"]["difference"] == pytest.approx(0.15, abs=0.15)
+    table = json.loads((benchmark.plan().folder(Unit("benchmark_table")) / "table.json").read_text())
+    rivals = {c["b"] for c in table["comparisons"]}
+    assert rivals == {"hold_still/state", "mine_k01/state"}
+    assert set(benchmark.plan().stale()) == set(LATER)
+
+    # The third: with other settings nothing is said of it, and whoever is worse takes nobody's place.
+    metadata, check, told = run(0.3, seeds=3)
+    assert metadata["regression"] == "not comparable"
+    assert check["passed"]
+    assert check["why"].startswith("It cannot be compared with the result of 20")
+    assert "budget differs: 2 seeds" in check["why"]
+    assert (metadata["champion"], told) == ("mine_k01/state", [])
+    assert "champion_from_now_on" not in metadata
+
+    # All are in the store, with everything that a reader of the history needs.
+    first, second, third = read_history(benchmark.store, "tiny")
+    assert (first.promotion["verdict"], second.promotion, second.named) == ("better", None, "mean_action")
+    assert len({line.table for line in (first, second, third)}) == 3
+    assert {row["policy"] for row in second.rows} == {row["policy"] for row in table["policies"]}
+    page = (benchmark.store.dataset("tiny") / "benchmark_history" / "history.html").read_text(encoding="utf-8")
+    assert page.count("<tr>") == 4
+    assert first.content_hash[:12] in page
+    assert not (benchmark.store.root / LOG).exists()
