@@ -24,7 +24,6 @@ from pipeline.methods import EXTERNAL
 
 if TYPE_CHECKING:
     from pipeline.history import Line
-    from pipeline.sinks.to_mlflow import Message
 
 TABLE = dg.AssetKey(["benchmark_table"])
 REPORT = dg.AssetKey(["benchmark_report"])
@@ -163,7 +162,8 @@ def _write_table(bench: Bench, draft) -> Outcome:
     floors, estimates = load_floors(floor / "radius.json"), load_estimates(floor / ESTIMATES)
     facts = bench.summary(Unit("demonstrations"))["inspect"]
     modes = json.loads((plan.folder(Unit("action_modes")) / "modes.json").read_text(encoding="utf-8"))
-    built = build_table(facts, with_champion(bench), bench.split, floors, estimates, entries, modes)
+    experiment = with_champion(bench.store, plan.key, bench.experiment)
+    built = build_table(facts, experiment, bench.split, floors, estimates, entries, modes)
     built["key"] = plan.key
     write_json(draft / "table.json", built)
     rows = [
@@ -185,20 +185,7 @@ def _write_table(bench: Bench, draft) -> Outcome:
             "baselines_present": ("hold_still" in names, f"{len(rows)} rows"),
             "same_data": (hashes == {bench.split.hash}, f"split {bench.split.hash[:16]}"),
         },
-        crown(bench, bench.experiment.dataset.champion),
     )
-
-
-def crown(bench: Bench, champion: str | None) -> list["Message"]:
-    """MLflow's registry is told whose model has the alias `champion`: that of a row, `policy/observations`, or of a policy that
-    has one row."""
-    from pipeline.sinks.to_mlflow import about_champion
-
-    rows = [u for u in bench.plan.fresh_policy_units("predictions") if champion in (f"{u.policy}/{u.entry}", u.policy)]
-    if len(rows) != 1:
-        return []
-    variant = next(v for v in bench.plan.variants if v.name == rows[0].policy)
-    return [about_champion(bench.run_card(variant, rows[0].entry))]
 
 
 def _rolled_out(bench: Bench, unit: Unit) -> dict:

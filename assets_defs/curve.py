@@ -10,6 +10,7 @@ from pydantic import Field
 
 from assets_defs.data import PARTITIONS, episode_split
 from assets_defs.floor import ESTIMATES, multimodality_floor
+from assets_defs.history import with_champion
 from assets_defs.plan import CODE_VERSIONS, Plan, Unit, curve_unit, sizes_of
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result
 from assets_defs.show import picture, present, table
@@ -56,7 +57,8 @@ def curve_assets(predictions: Sequence[dg.AssetKey]) -> list[dg.AssetsDefinition
         benchmark: it trains for longer than one.
         """
         bench = workbench.open(context, budget)
-        units = curves_asked(bench.experiment, bench.plan.variants, budget.policies, budget.observations, config.sizes)
+        experiment = with_champion(bench.store, bench.plan.key, bench.experiment)
+        units = curves_asked(experiment, bench.plan.variants, budget.policies, budget.observations, config.sizes)
         made = {
             unit.entry: bench.make(unit, lambda draft, unit=unit: _draw_curve(bench, unit, draft)) for unit in units
         }
@@ -95,7 +97,8 @@ def curves_asked(
 ) -> list[Unit]:
     """The curves that a launch asks for: of the policies it names, with the observation sets it names.
 
-    Without names: the data set's champion (with the set that it names), else the first policy that is trained by itself.
+    Without names: the champion of `experiment` (with the set that it names), else the first policy that is trained by itself. The
+    champion is that of the history (`history.with_champion`), which may be gone since.
 
     Raises
     ------
@@ -104,10 +107,10 @@ def curves_asked(
     """
     from pipeline.curve import require_learning
 
+    known = {v.name: v for v in variants}
     champion, _, champions_set = (experiment.dataset.champion or "").partition("/")
     by_itself = [v.name for v in variants if v.is_trained and not v.only_when_named]
-    names = list(policies) or [champion or (by_itself or ["nearest_neighbour"])[0]]
-    known = {v.name: v for v in variants}
+    names = list(policies) or [champion if champion in known else (by_itself or ["nearest_neighbour"])[0]]
     units = []
     for name in names:
         if name not in known:

@@ -1,4 +1,4 @@
-"""What happens after a table was made: its entry in the history, the chart of all entries, and telling people of news.
+"""What happens after a table was made: its entry in the history, the chart of all entries, and telling people and MLflow.
 
 What belongs here: from an opened partition to `pipeline.history`. What does not: who the champion is and whether it got worse
 (there), how a message is sent (`pipeline.notify`).
@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any
 from assets_defs.plan import Unit
 from assets_defs.resources import Bench
 from pipeline.experiment import Experiment
-from pipeline.store import Made
+from pipeline.store import Made, Store
 
 if TYPE_CHECKING:
     from pipeline.history import Line, Result
+    from pipeline.sinks.to_mlflow import Message
 
 Clock = Callable[[], datetime]
 PAGE, PICTURE = "history.html", "history.png"
@@ -33,13 +34,16 @@ def history_folder(bench: Bench) -> Path:
     return bench.store.folder(bench.plan.key, FOLDER)
 
 
-def with_champion(bench: Bench) -> Experiment:
-    """The experiment with the champion that its next table is compared with: the file's, or who took its place since."""
+def with_champion(store: Store, key: str, experiment: Experiment) -> Experiment:
+    """The experiment with the champion that its next table is compared with: the file's, or who took its place since.
+
+    Plans are made of the experiment as it was: a fingerprint that knew of a promotion would make the table stale by it.
+    """
     from pipeline.history import champion_of, read_history
 
-    dataset = bench.experiment.dataset
-    champion = champion_of(read_history(bench.store, bench.plan.key), dataset.champion)
-    return bench.experiment.model_copy(update={"dataset": dataset.model_copy(update={"champion": champion})})
+    dataset = experiment.dataset
+    champion = champion_of(read_history(store, key), dataset.champion)
+    return experiment.model_copy(update={"dataset": dataset.model_copy(update={"champion": champion})})
 
 
 def record(bench: Bench, made: Made, code: str, run_id: str | None, clock: Clock = now) -> "Line":
@@ -64,9 +68,23 @@ def record(bench: Bench, made: Made, code: str, run_id: str | None, clock: Clock
         before=kept_errors(bench.store, key),
     )
     _draw(bench, [*lines, line], table)
+    bench.post(Unit("benchmark_table"), made.fingerprint, crown(bench, line.next_champion))
     append(bench.store, key, line, errors)
+    bench.deliver()
     _tell(bench, line, lines, run_id)
     return line
+
+
+def crown(bench: Bench, champion: str | None) -> "list[Message]":
+    """MLflow's registry is told whose model has the alias `champion`: that of a row, `policy/observations`, or of a policy that
+    has one row."""
+    from pipeline.sinks.to_mlflow import about_champion
+
+    rows = [u for u in bench.plan.fresh_policy_units("predictions") if champion in (f"{u.policy}/{u.entry}", u.policy)]
+    if len(rows) != 1:
+        return []
+    variant = next(v for v in bench.plan.variants if v.name == rows[0].policy)
+    return [about_champion(bench.run_card(variant, rows[0].entry))]
 
 
 def _results(bench: Bench) -> "dict[str, Result]":

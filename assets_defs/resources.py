@@ -226,20 +226,27 @@ class Bench:
                 summary,
             )
             self.store.write_made(draft, made)
-            for message in outcome.told:
-                self.outbox.post(message, folder, "/".join(filter(None, (unit.asset, unit.entry))), made.fingerprint)
+            self.post(unit, made.fingerprint, outcome.told)
         self.plan.forget()
-        return self._tell_mlflow(folder, made) if outcome.told else made
+        if not outcome.told:
+            return made
+        self.deliver()
+        return self.store.made(folder) or made  # it knows its MLflow run now
 
-    def _tell_mlflow(self, folder: Path, made: Made) -> Made:
-        """Send what is kept for MLflow; returns the result, which knows its run then."""
+    def post(self, unit: Unit, fingerprint: str, messages: Sequence["Message"]) -> None:
+        """Keep for MLflow what it is to hear of a result."""
+        for message in messages:
+            about = "/".join(filter(None, (unit.asset, unit.entry)))
+            self.outbox.post(message, self.plan.folder(unit), about, fingerprint)
+
+    def deliver(self) -> None:
+        """Send what is kept for MLflow; where it does not answer, say so and go on."""
         delivery = self.outbox.deliver(patient=False)
         if delivery.kept:
             self.warn(
                 f"MLflow at {self.outbox.address} cannot be told now ({delivery.why}): {delivery.kept} messages are kept in "
                 f"{self.outbox.folder}."
             )
-        return self.store.made(folder) or made
 
 
 def result(

@@ -28,6 +28,7 @@ def run_curve(
 ) -> None:
     """Make what is stale of one policy's learning curve, and say what it means."""
     from assets_defs.curve import curves_asked
+    from assets_defs.history import with_champion
     from assets_defs.plan import Plan
 
     session = open_session(config_path, store_path, json_to)
@@ -36,7 +37,8 @@ def run_curve(
     asked = parse_sizes(sizes)
     target = resolve_target(dataset, session.config, session.config_dir, chosen, session.store.experiments())
     variants = target.experiment.variants
-    curves = curves_asked(target.experiment, variants, chosen.policies, wanted, asked)
+    of_now = with_champion(session.store, target.key, target.experiment)
+    curves = curves_asked(of_now, variants, chosen.policies, wanted, asked)
     check_source([target], session)
     target = replace(target, selected=tuple(v for v in variants if v.name == _policy_of(curves)))
     plan = Plan(session.store, target.key, target.experiment, tuple(variants), (_policy_of(curves),), wanted)

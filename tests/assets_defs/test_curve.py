@@ -151,6 +151,8 @@ def test_which_curves_are_asked_for(drawn):
     assert curves_asked(e, e.variants) == [UNIT], "the first policy that is trained"
     champion = e.model_copy(update={"dataset": e.dataset.model_copy(update={"champion": "nearest_neighbour/state"})})
     assert curves_asked(champion, e.variants) == [curve_unit("nearest_neighbour", "state")]
+    gone = e.model_copy(update={"dataset": e.dataset.model_copy(update={"champion": "mlp_k64/state"})})
+    assert curves_asked(gone, e.variants) == [UNIT], "who was promoted may not be in the file any more"
     assert curves_asked(champion, e.variants, ["mlp_k01"], ["state"], [8, 4]) == [
         curve_unit("mlp_k01", "state", [4, 8])
     ]

@@ -3,13 +3,16 @@
 import json
 
 import dagster as dg
+import mlflow
 import pytest
 
 from assets_defs.launch import open_instance, run_benchmark
 from assets_defs.plan import SUMMARIES, Unit
 from assets_defs.resources import asset_keys
+from demobench.commands.curve import run_curve
 from pipeline.history import read_history
 from pipeline.notify import LOG
+from pipeline.sinks.to_mlflow import tracking_uri
 from pipeline.store import Store
 from tests.assets_defs.conftest import TinyBenchmark, why_failed
 from tests.makers import tiny_recording, write_v3
@@ -35,10 +38,26 @@ class Mine:
 """
 
 
+CONFIG = """
+[benchmark]
+seeds = 2
+folds = 2
+steps = 1
+threads = 1
+[datasets.tiny]
+source = "{folder}"
+champion = "mean_action"
+[policies.mine]
+method = "{method}"
+chunks = [1]
+settings = {{off = 0.0}}
+"""
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A benchmark whose champion is a baseline, and a function that makes the next table, of a policy that is so far off."""
-    folder = write_v3(tmp_path_factory.mktemp("data") / "tiny", tiny_recording(episodes=12, frames=30))
+    folder = write_v3(tmp_path_factory.mktemp("data") / "tiny", tiny_recording(episodes=16, frames=30))
     home = tmp_path_factory.mktemp("history")
     (home / "mine.py").write_text(POLICY)
     told = home / "told"
@@ -69,6 +88,39 @@ def made(tmp_path_factory):
     return benchmark, run
 
 
+def holder_of_the_alias(benchmark: TinyBenchmark) -> str:
+    """The MLflow run whose model is `models:/tiny@champion`."""
+    client = mlflow.MlflowClient(tracking_uri("sqlite", benchmark.store.root))
+    return client.get_model_version_by_alias("tiny", "champion").run_id
+
+
+def run_of(benchmark: TinyBenchmark, policy: str) -> str:
+    """The MLflow run of a policy as it is trained now."""
+    made = benchmark.store.made(benchmark.plan().folder(Unit(f"{policy}/trained_policy", "state")))
+    return made.summary["mlflow_run_id"]
+
+
+def draw_a_curve(benchmark: TinyBenchmark) -> list[str]:
+    """Launch the job `curve` as from the UI, without naming a policy; returns the curves that there are then."""
+    with open_instance(benchmark.store.root) as instance:
+        curve, sizes = dg.AssetKey(["learning_curve"]), {"learning_curve": {"sizes": [4]}}
+        run = run_benchmark(instance, benchmark.defs(), "tiny", [curve], job_name="curve", ops=sizes)
+        assert run.is_success, why_failed(instance, run)
+    return [unit.entry for unit in benchmark.plan().curves()]
+
+
+def curve_of_the_command_line(benchmark: TinyBenchmark) -> str:
+    """Whose curve `demobench curve tiny` shows; it is there, so nothing is trained."""
+    file, shown = benchmark.store.root / "demobench.toml", benchmark.store.root / "curve.json"
+    method = benchmark.raw["policies"]["mine"]["method"]
+    file.write_text(CONFIG.format(folder=benchmark.folder, method=method))
+    run_curve(
+        "tiny", policy=None, sizes="4", more=8, worthwhile=0.5, choices={"observations": None}, config_path=file,
+        store_path=str(benchmark.store.root), json_to=str(shown),
+    )  # fmt: skip
+    return json.loads(shown.read_text())["policy"]
+
+
 def test_the_champion_is_promoted_watched_and_told_of(made):
     benchmark, run = made
     # The first table: what is better than the champion that was named takes its place, from the next table on.
@@ -82,11 +134,20 @@ def test_the_champion_is_promoted_watched_and_told_of(made):
     assert told[0]["numbers"]["difference"] < 0
     assert set(benchmark.plan().stale()) == set(LATER), "a promotion makes no table stale"
     assert "data:image/png;base64" in metadata["history"]
+    assert holder_of_the_alias(benchmark) == run_of(benchmark, "mine_k01"), (
+        "MLflow's champion is who is champion from now on"
+    )
+    assert draw_a_curve(benchmark) == ["mine_k01/state/4"]
+    assert curve_of_the_command_line(benchmark) == "mine_k01"
+    assert set(benchmark.plan().stale()) == set(LATER), "nor does its learning curve"
+
+    first_run = run_of(benchmark, "mine_k01")
 
     # The second: the new champion is what rows are compared with, and it got worse.
     metadata, check, told = run(0.3)
     assert metadata["champion"] == "mine_k01/state"
     assert metadata["regression"] == "worse"
+    assert holder_of_the_alias(benchmark) == run_of(benchmark, "mine_k01") != first_run
     assert not check["passed"]
     assert check["why"].startswith("It got worse than the result of 20")
     assert [t["event"] for t in told] == ["regression"]

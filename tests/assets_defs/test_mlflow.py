@@ -8,7 +8,7 @@ import mlflow
 import numpy as np
 import pytest
 
-from assets_defs.benchmark import crown
+from assets_defs.history import crown
 from assets_defs.plan import Unit
 from assets_defs.resources import Bench, Workbench
 from pipeline.lerobot_format.saved import load_demonstrations
