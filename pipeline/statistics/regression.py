@@ -19,9 +19,9 @@ FEWEST_SEEDS = 2
 MARGIN = 0.05
 """Without it, a mean over nearest neighbours whose training episodes were drawn anew was stopped 7 times of 50."""
 
-FALSE_ALARMS_AT_MOST, POWER = 0.052, 0.92
-"""Limits of what was measured at 50 episodes (docs/automation.md), which the check's description tells; a test holds the study
-(`python -m speed.gate`) against them."""
+FALSE_ALARMS_AT_MOST, POWER = 0.052, 0.99
+"""What the check's description tells, both of 50 episodes: the upper limit that the known-truth suite measured without MARGIN,
+which MARGIN can only lower, and the lower limit of `python -m speed.gate` (docs/automation.md); a test holds that study to both."""
 
 CONDITIONS = {
     "content_hash": "data hash",

@@ -1,5 +1,7 @@
 """The gate's false alarms and power, measured; and that a broken gate would be noticed."""
 
+import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -33,6 +35,20 @@ def test_two_results_of_one_method_do_differ():
 
 def test_rates_have_exact_intervals():
     assert rate([False] * 400) == (0.0, 0.0, pytest.approx(1 - 0.025 ** (1 / 400)))
+
+
+def test_the_page_shows_every_setting_and_the_constants_are_within_what_it_shows():
+    text = (Path(__file__).resolve().parents[3] / "docs" / "automation.md").read_text(encoding="utf-8")
+    limits = r"\d+\.\d \((\d+\.\d) … (\d+\.\d)\)"
+    rows = re.findall(rf"^\| ([^|]+) \| {limits} \| {limits} \| [^|]+ \| 400 \|$", text, re.MULTILINE)
+    assert [row[0] for row in rows] == [setting.words for setting in SETTINGS]
+    for setting, (_, _, alarm_high, power_low, _) in zip(SETTINGS, rows, strict=True):
+        if setting.episodes == 50:
+            assert float(alarm_high) <= 100 * FALSE_ALARMS_AT_MOST
+            assert float(power_low) >= 100 * POWER
+    assert f"{100 * FALSE_ALARMS_AT_MOST:.1f} % is the upper limit of the" in text
+    assert f"to see a fifth in {100 * POWER:.0f} %, the lower limit above" in text
+    assert f"that is at most {52 * FALSE_ALARMS_AT_MOST:.1f} false alarms a year" in text
 
 
 @pytest.mark.slow
