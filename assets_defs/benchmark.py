@@ -13,8 +13,8 @@ from assets_defs.curve import KEY as CURVE
 from assets_defs.curve import read_kept
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
 from assets_defs.floor import ESTIMATES
-from assets_defs.history import PAGE, PICTURE, history_folder, record, with_champion
-from assets_defs.links import experiment_link, file_link
+from assets_defs.history import history_folder, record, with_champion
+from assets_defs.links import experiment_link, file_link, history_link
 from assets_defs.looking import VIDEO, driven_videos
 from assets_defs.plan import Unit
 from assets_defs.resources import Bench, Budget, Outcome, Workbench, check_spec, code_version, result, warning_spec
@@ -110,9 +110,10 @@ def _benchmark_table(
 
 
 def _links(context: dg.AssetExecutionContext, bench: Bench) -> dict[str, dg.UrlMetadataValue]:
-    """Where the page and MLflow's comparison are, for whoever looks at the asset or (as tags) at the run."""
+    """Where the pages and MLflow's comparison are, for whoever looks at the asset or (as tags) at the run."""
     links = {
         "report": file_link(bench, Unit("benchmark_report"), "report.html"),
+        "history": history_link(bench),
         "mlflow": experiment_link(bench, bench.outbox.experiment_id(bench.plan.key)),
     }
     context.instance.add_run_tags(context.run.run_id, {f"demobench/{name}": link for name, link in links.items()})
@@ -120,16 +121,14 @@ def _links(context: dg.AssetExecutionContext, bench: Bench) -> dict[str, dg.UrlM
 
 
 def _history_metadata(bench: Bench, line: "Line") -> dict[str, Any]:
-    from pipeline.history import in_words
+    from pipeline.history import PICTURE, in_words
 
-    folder = history_folder(bench)
     return {
         "champion": line.champion,
         "champion_from_now_on": line.next_champion if line.promotion else None,
         "regression": (line.regression or {}).get("word"),
         "champion_in_words": in_words(line),
-        "history": picture(folder / PICTURE),
-        "history_page": dg.MetadataValue.path(str(folder / PAGE)),
+        "history_chart": picture(history_folder(bench) / PICTURE),
     }
 
 
@@ -279,6 +278,7 @@ def _curves(bench: Bench) -> dict:
 
 
 def _write_report(bench: Bench, draft) -> Outcome:
+    from pipeline.history import FOLDER, PAGE
     from pipeline.predict import load_predictions
     from pipeline.simulate.trial import load_rollouts
     from pipeline.sinks.figures import benchmark_figures
@@ -291,6 +291,7 @@ def _write_report(bench: Bench, draft) -> Outcome:
     plan = bench.plan
     built = json.loads((plan.folder(Unit("benchmark_table")) / "table.json").read_text())
     built["artifacts"] |= {"mcap": "../mcap_log/held_out.mcap", "rerun": "../rerun_recording/held_out.rrd"}
+    built["artifacts"]["history"] = f"../{FOLDER}/{PAGE}"
     predictions = [load_predictions(plan.folder(u)) for u in plan.fresh_predictions()]
     floors = load_floors(plan.folder(Unit("multimodality_floor")) / "radius.json")
     rolled = [u for u in plan.fresh_policy_units("rollouts") if bench.summary(u)["rollouts"]]

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from pipeline.sinks.to_mlflow import Message
 
 Clock = Callable[[], datetime]
-PAGE, PICTURE = "history.html", "history.png"
 
 
 def now() -> datetime:
@@ -105,6 +104,7 @@ def _results(bench: Bench) -> "dict[str, Result]":
 
 def _draw(bench: Bench, lines: "list[Line]", table: dict[str, Any]) -> None:
     """The chart and the page of all entries, each written whole."""
+    from pipeline.history import PAGE, PICTURE
     from pipeline.sinks import replacing
     from pipeline.sinks.history_page import picture_history, write_history_page
     from pipeline.sinks.words import common_unit
@@ -115,7 +115,7 @@ def _draw(bench: Bench, lines: "list[Line]", table: dict[str, Any]) -> None:
         with replacing(folder / PICTURE) as draft:
             draft.write_bytes(picture)
     with replacing(folder / PAGE) as draft:
-        write_history_page(lines, picture, draft, name=bench.plan.key, unit=unit)
+        write_history_page(lines, draft, name=bench.plan.key, unit=unit)
 
 
 def _tell(bench: Bench, line: "Line", lines: "list[Line]", run_id: str | None) -> None:

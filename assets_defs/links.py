@@ -1,6 +1,6 @@
 """Links from the Dagster UI to where a result is seen in a browser: MLflow's pages, and the files of the store.
 
-A page that comes over http may not open a file of the disk (browsers refuse), so `demobench ui` serves the store's reports and
+A page that comes over http may not open a file of the disk (browsers refuse), so `demobench ui` serves the store's pages and
 recordings on 127.0.0.1 beside Dagster and MLflow. It keeps in the store where; until it ran, links point at its default ports.
 What does not belong here: serving (`demobench ui`).
 """
@@ -50,7 +50,18 @@ def _kept_in(store: Store) -> Path:
 
 def file_link(bench: Bench, unit: Unit, name: str) -> str:
     """The address of a file of one result."""
-    return f"{served(bench.store).files}/{quote(bench.plan.key)}/{quote(unit.asset)}/{quote(name)}"
+    return _in_folder(bench, unit.asset, name)
+
+
+def history_link(bench: Bench) -> str:
+    """The address of the page of all tables of a data set."""
+    from pipeline.history import FOLDER, PAGE
+
+    return _in_folder(bench, FOLDER, PAGE)
+
+
+def _in_folder(bench: Bench, folder: str, name: str) -> str:
+    return f"{served(bench.store).files}/{quote(bench.plan.key)}/{quote(folder)}/{quote(name)}"
 
 
 def run_link(bench: Bench, run_id: str) -> str:

@@ -32,7 +32,7 @@ CODE_VERSIONS = {
     "rollouts": "4",
     "scored_predictions": "2",
     "benchmark_table": "7",
-    "benchmark_report": "9",
+    "benchmark_report": "10",
     "rollout_video": "1",
     "mcap_log": "2",
     "rerun_recording": "3",

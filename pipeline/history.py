@@ -24,6 +24,7 @@ from pipeline.store import MADE, Made, Store
 from pipeline.types import EpisodeErrors, Protocol
 
 FOLDER = "benchmark_history"
+PAGE, PICTURE = "history.html", "history.png"
 ERRORS = "errors.safetensors"
 SHOWN = ("policy", "observations", "method", "seeds", METRIC, "vs_hold_still")
 

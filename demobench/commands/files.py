@@ -1,4 +1,4 @@
-"""The files of a store over http on 127.0.0.1: reports, recordings and videos to look at, and nothing else.
+"""The files of a store over http on 127.0.0.1: reports, histories, recordings and videos to look at, and nothing else.
 
 What belongs here: which files, and who may ask. What does not: starting and stopping (`ui`). It reads; nothing can be changed
 through it. Like Dagster and MLflow it knows no users, so it answers only this machine, and only under this machine's names:
@@ -16,16 +16,18 @@ from urllib.parse import quote, unquote, urlsplit
 from assets_defs.links import HOST
 from pipeline.config import check_slug
 from pipeline.errors import ConfigError
+from pipeline.history import FOLDER as HISTORY
 from pipeline.sinks.markup import Html, element
 from pipeline.store import Store
 
 SHOWN = {
     "benchmark_report": ("report", {".html": "text/html; charset=utf-8"}),
+    HISTORY: ("history", {".html": "text/html; charset=utf-8"}),
     "rollout_video": ("video", {".mp4": "video/mp4"}),
     "rerun_recording": ("Rerun recording", {".rrd": "application/octet-stream"}),
     "mcap_log": ("MCAP", {".mcap": "application/octet-stream"}),
 }
-"""Asset → what people call it, and its files by how they end."""
+"""Folder of a data set (an asset's, or the history) → what people call it, and its files by how they end."""
 
 STYLE = """:root { color-scheme: light dark }
 body { max-width: 60rem; margin: 3rem auto; padding: 0 1rem; font: 16px/1.5 system-ui, sans-serif }

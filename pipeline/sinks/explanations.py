@@ -22,6 +22,7 @@ from pipeline.sinks.findings import (
     success_words,
     without_floor,
 )
+from pipeline.sinks.markup import element
 from pipeline.sinks.palette import is_baseline
 from pipeline.sinks.words import common_unit, is_number, plural, show
 
@@ -266,6 +267,7 @@ def files(table: Table) -> dict[str, str]:
             lambda at: f"{at} (opens in Foxglove, PlotJuggler, Rerun, rosbags)",
         ),
         "mlflow": ("Metrics and models", lambda at: f"{at} (demobench ui)"),
+        "history": ("Every table so far, and who is champion", lambda at: element("a", "the history", href=at)),
     }
     found = {key: table["artifacts"].get(key) for key in commands}
     return {commands[key][0]: commands[key][1](str(at)) for key, at in found.items() if at}

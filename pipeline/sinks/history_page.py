@@ -4,57 +4,68 @@ What belongs here: how entries are drawn and told. What does not: the entries (`
 imports Altair.
 """
 
-import base64
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import altair as alt
 
-from pipeline.history import Line, in_words
+from pipeline.history import Line, in_words, promotion_words, regression_words
 from pipeline.sinks.drawing import HEIGHT, WIDTH, chart_png, colour_by_policy, inline, number, with_unit
-from pipeline.sinks.markup import Html, element, join
-from pipeline.sinks.page_style import style_sheet
-from pipeline.sinks.palette import INK, policy_colours
+from pipeline.sinks.markup import Html, element
+from pipeline.sinks.page_style import style_sheet, themed
+from pipeline.sinks.palette import CONFIG, INK, policy_colours
+from pipeline.sinks.report_sections import verdict
 from pipeline.sinks.words import DASH, plural, show, show_interval
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+REPORT = "../benchmark_report/report.html"
+"""Where the report lies, seen from the page: on the disk and over http alike."""
+SHAPES = {"circle": "●", "square": "■", "diamond": "◆", "triangle-up": "▲", "cross": "✚"}
+"""Of points, by observation set, and how they are written."""
 LATEST = 30
 """So many tables are in the chart; all are on the page."""
 LARGEST_TIMES = 4.0
 """Rows whose error never is within so many times the smallest are left out of the chart: they would flatten the rest."""
 
 
-def history_chart(lines: Sequence[Line], *, unit: str | None) -> alt.LayerChart:
+def history_chart(lines: Sequence[Line], *, unit: str | None, legend: bool = True) -> alt.LayerChart:
     """First-step errors with their intervals, a point a table, in the order in which the latest tables were made.
 
-    A ring marks the champion. Tooltips name the data and the code.
+    A ring marks the champion. Tooltips name the data and the code. The scale is beside the latest table.
     """
     points = _points(lines)
     policies = sorted({point["policy"] for point in points})
+    addresses, sets = (sorted({point[of] for point in points}) for of in ("address", "observations"))
     order = [_label(place, line) for place, line in _latest(lines)]
-    x = alt.X(
-        "run:O", sort=order, title="table, with the commit of the code", axis=alt.Axis(grid=False, labelAngle=-40)
-    )
+    by_words = alt.Axis(grid=False, labelAngle=0, labelExpr="split(datum.label, ' ')", labelLineHeight=14)
+    x = alt.X("run:O", sort=order, title="table, when it was made, commit of the code", axis=by_words)
     top = max((p["high"] or p["error"] for p in points), default=1.0)
     y = alt.Y(
         "error:Q",
         title=with_unit("first-step MAE", unit),
         scale=alt.Scale(domain=[0, number(1.08 * top) or 1.0], nice=False),
+        axis=alt.Axis(orient="right"),
     )
     shown = {"address": "policy", "run": "table", "data": "data", "code": "code"}
     told = [alt.Tooltip(f"{key}:N", title=title) for key, title in shown.items()]
     told += [alt.Tooltip(f"{key}:Q", format=".3~g") for key in ("error", "low", "high")]
-    aside = alt.XOffset("address:N", sort=sorted({point["address"] for point in points}))
+    aside = alt.XOffset("address:N", sort=addresses)
     base = alt.Chart(inline(points)).encode(x=x, xOffset=aside, detail="address:N", tooltip=told)
-    colour = colour_by_policy(policies, policies)
-    champion = base.transform_filter("datum.champion").mark_point(size=190, strokeWidth=2, color=INK.light, opacity=1)
+    named = alt.Legend(symbolOpacity=1) if legend else None
+    colour = colour_by_policy(policies, policies, legend=named)
+    # Of a policy with two observation sets both have its colour.
+    by_set = alt.Legend(symbolFillColor=INK.light, symbolStrokeColor=INK.light) if legend and len(sets) > 1 else None
+    shape = alt.Shape("observations:N", scale=alt.Scale(domain=sets, range=list(SHAPES)), legend=by_set)
+    champion = base.transform_filter("datum.champion").mark_point(size=210, strokeWidth=2, color=INK.light, opacity=1)
     layers = [
+        base.mark_line(strokeWidth=1.5, opacity=0.45).encode(y=y, color=colour),
         base.mark_rule(strokeWidth=2).encode(y=alt.Y("low:Q"), y2="high:Q", color=colour),
-        base.mark_point(filled=True, size=70, opacity=1).encode(y=y, color=colour),
+        base.mark_point(filled=True, size=70, opacity=1).encode(y=y, color=colour, shape=shape),
         champion.encode(y=y),
     ]
-    return alt.layer(*layers).properties(width=max(WIDTH, 90 * len(order)), height=HEIGHT)
+    return alt.layer(*layers).properties(width=max(WIDTH, (40 + 5 * len(addresses)) * len(order)), height=HEIGHT)
 
 
 def _points(lines: Sequence[Line]) -> list[dict[str, Any]]:
@@ -67,7 +78,8 @@ def _points(lines: Sequence[Line]) -> list[dict[str, Any]]:
             address = f"{row['policy']}/{row['observations']}"
             found.append(
                 {
-                    "run": _label(place, line), "policy": row["policy"], "address": address, "champion": address == line.champion,
+                    "run": _label(place, line), "policy": row["policy"], "observations": row["observations"], "address": address,
+                    "champion": address == line.champion,
                     "error": number(row["first_step_mae"]), "low": number(low), "high": number(high),
                     "data": _data(line), "code": line.code,
                 }
@@ -103,60 +115,109 @@ def picture_history(lines: Sequence[Line], *, unit: str | None) -> bytes | None:
     return chart_png(history_chart(lines, unit=unit)) if _points(lines) else None
 
 
-def write_history_page(
-    lines: Sequence[Line], picture: bytes | None, path: Path, *, name: str, unit: str | None
-) -> None:
+def write_history_page(lines: Sequence[Line], path: Path, *, name: str, unit: str | None) -> None:
     """The page: who the champion is, the chart, and a row for each table, the latest first."""
-    last = lines[-1]
     policies = policy_colours({row["policy"] for line in lines for row in line.rows})
     head = [
         element("meta", charset="utf-8"),
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", name="color-scheme", content="light dark"),
         element("meta", http_equiv="Content-Security-Policy", content=POLICY),
+        element("link", rel="icon", href="data:,"),
         element("title", f"{name}: history"),
         element("style", style_sheet(policies)),
     ]
+    report = element("a", "the report of the latest table", href=REPORT)
     main = element(
         "main",
-        element("header", element("p", "demobench", class_="brand"), element("h1", f"{name}: history")),
-        element("div", element("p", in_words(last)), class_="short"),
-        _chart(picture, len(lines)) if picture else None,
+        element(
+            "header",
+            element("p", "demobench", class_="brand"),
+            element("h1", f"{name}: history"),
+            element("p", f"{plural(len(lines), 'table')} · ", report, class_="facts"),
+        ),
+        element("div", element("p", in_words(lines[-1])), class_="short"),
+        _chart(lines, unit) if _points(lines) else None,
         element("section", element("h2", "Every table"), _rows(lines, unit)),
     )
     body = element("html", element("head", head), element("body", main), lang="en")
     path.write_text(f"<!doctype html>\n{body}\n", encoding="utf-8")
 
 
-def _chart(picture: bytes, tables: int) -> Html:
-    source = f"data:image/png;base64,{base64.b64encode(picture).decode()}"
-    about = f"First-step errors of {plural(min(tables, LATEST), 'table')}; the numbers are in the table below"
+def _chart(lines: Sequence[Line], unit: str | None) -> Html:
+    """The chart in the reader's colours, as wide as it is: a narrow screen shows the latest tables and scrolls to the others."""
+    import vl_convert
+
+    chart = history_chart(lines, unit=unit, legend=False)
+    looks = themed(CONFIG) | {"background": "transparent"}
+    drawn = vl_convert.vegalite_to_svg(themed(chart.to_dict()), config=looks, allowed_base_urls=[])
+    about = f"First-step errors of {plural(min(len(lines), LATEST), 'table')}; the numbers are in the table below"
     words = "Bars are 95 % intervals over held-out episodes and training seeds; a ring marks the champion."
-    image = element("img", src=source, alt=about, style="max-width:100%;height:auto;background:#fff")
-    return element("section", image, element("p", words))
+    at_the_left = "direction:ltr;width:max-content;margin:0 auto 0 0"
+    picture = element("div", Html(drawn), role="img", aria_label=about, style=at_the_left)
+    # A box that is read from the right is scrolled to its right end.
+    box = {
+        "class_": "scroll",
+        "tabindex": "0",
+        "role": "region",
+        "aria_label": "Chart",
+        "style": "direction:rtl;border:0",
+    }
+    return element("section", element("div", picture, **box), _legend(_points(lines)), element("p", words))
+
+
+def _legend(points: Sequence[Mapping[str, Any]]) -> Html:
+    """Colours, and shapes where there are several observation sets; beside the chart, so that it stays where the chart scrolls."""
+    policies, sets = (sorted({point[of] for point in points}) for of in ("policy", "observations"))
+    named = [
+        element("span", element("span", class_="swatch", data_policy=policy), policy, style="margin-right:1.2em")
+        for policy in policies
+    ]
+    if len(sets) > 1:
+        named += [f"{mark} {name}  " for mark, name in zip(cycle(SHAPES.values()), sets, strict=False)]
+    return element("p", named, class_="facts")
 
 
 def _rows(lines: Sequence[Line], unit: str | None) -> Html:
-    head = ["", "made", "data", "code", "champion", f"its first-step MAE ({unit or 'unit unknown'})", "success", "said"]
-    rows = [element("tr", [element("th", words, scope="col") for words in head])]
+    """On narrow screens a list of cells that say their heading, as the tables of the report are."""
+    heads = [
+        "table",
+        "champion",
+        f"first-step MAE ({unit or 'unit unknown'})",
+        "trained anew",
+        "success",
+        "data and code",
+    ]
+    rows = []
     for place, line in reversed(list(enumerate(lines))):
         row = _champions_row(line)
+        error = (show(row["first_step_mae"]), show_interval(row["interval"])) if row else (DASH, None)
         cells = [
-            str(place + 1), f"{line.when[:10]} {line.when[11:16]} UTC", _data(line), line.code, line.champion or DASH,
-            f"{show(row['first_step_mae'])} {show_interval(row['interval'])}" if row else DASH, _success(row), in_words(line),
+            (f"{place + 1}: {line.when[:10]}", f"{line.when[11:16]} UTC"), (line.champion or DASH, None), error,
+            (verdict(line.regression and line.regression["word"]), None), _success(row), (_data(line), line.code),
         ]  # fmt: skip
-        rows.append(element("tr", [element("td", words) for words in cells]))
-    return element(
-        "div", element("table", join(rows)), class_="scroll", tabindex="0", role="region", aria_label="Every table"
-    )
+        drawn = [
+            element("td", content, element("small", below) if below else None, data_head=head)
+            for head, (content, below) in zip(heads, cells, strict=True)
+        ]
+        rows.append(element("tr", drawn, element("td", _said(line), class_="wraps", data_head="what was said")))
+    names = [element("th", head, class_="left", scope="col") for head in (*heads, "what was said")]
+    inner = element("table", element("thead", element("tr", names)), element("tbody", rows))
+    return element("div", inner, class_="scroll words", tabindex="0", role="region", aria_label="Every table")
+
+
+def _said(line: Line) -> str:
+    return " ".join([regression_words(line), *([promotion_words(line)] if line.promotion else [])])
 
 
 def _champions_row(line: Line) -> Mapping[str, Any] | None:
     return next((row for row in line.rows if f"{row['policy']}/{row['observations']}" == line.champion), None)
 
 
-def _success(row: Mapping[str, Any] | None) -> str:
+def _success(row: Mapping[str, Any] | None) -> tuple[str, str | None]:
+    """The champion's success, and its interval with the number of roll-outs."""
     rolled = row and row["rollouts"]
     if not rolled or rolled["success"] is None:
-        return DASH
+        return DASH, None
     low, high = rolled["success_interval"] or (None, None)
-    return f"{show(rolled['success'], 2)} {show_interval((low, high), 2)} of {rolled['n']}"
+    return show(rolled["success"], 2), f"{show_interval((low, high), 2)} of {rolled['n']}"

@@ -28,7 +28,7 @@ INK = Colour("#1c2126", "#e8eaed")
 MUTED = Colour("#59626c", "#a3abb5")
 GRID = Colour("#e4e7eb", "#30363d")
 SUCCESS = Colour("#0a7cb5", "#58b8ee")
-FAILURE = Colour("#cc5a02", "#f58b4c")
+FAILURE = Colour("#c05502", "#f58b4c")
 
 TRAINED = (
     Colour("#0072b2", "#4aa8e8"),  # blue

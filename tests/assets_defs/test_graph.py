@@ -1,6 +1,7 @@
 """The whole graph on a tiny data set: what it makes, and what it makes again after a change."""
 
 import json
+import re
 import shutil
 
 import dagster as dg
@@ -29,6 +30,15 @@ def test_everything_is_made_once(finished):
         assert all(passed for passed, _ in made.summary["checks"].values()), unit
         assert made.seconds > 0
         assert made.peak_memory_mb > 10
+
+
+def test_the_report_and_the_history_lead_to_each_other(finished):
+    place = finished.store.dataset("tiny")
+    pages = {page: place / page for page in ("benchmark_report/report.html", "benchmark_history/history.html")}
+    for page, path in pages.items():
+        (other,) = (p for name, p in pages.items() if name != page)
+        leads = re.findall(r'<a href="([^"]+)">', path.read_text(encoding="utf-8"))
+        assert [(path.parent / lead).resolve() for lead in leads] == [other.resolve()]
 
 
 def test_the_table_has_every_policy_and_honest_numbers(finished):

@@ -1,15 +1,19 @@
 """Tables that are made one after another: the history, the champion and the gate, in Dagster and in the store."""
 
 import json
+from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import dagster as dg
 import mlflow
 import pytest
 
 from assets_defs.launch import open_instance, run_benchmark
+from assets_defs.links import FILES_PORT
 from assets_defs.plan import SUMMARIES, Unit
 from assets_defs.resources import asset_keys
 from demobench.commands.curve import run_curve
+from demobench.commands.files import FileServer
 from pipeline.history import read_history
 from pipeline.notify import LOG
 from pipeline.sinks.to_mlflow import tracking_uri
@@ -133,7 +137,7 @@ def test_the_champion_is_promoted_watched_and_told_of(made):
     )
     assert told[0]["numbers"]["difference"] < 0
     assert set(benchmark.plan().stale()) == set(LATER), "a promotion makes no table stale"
-    assert "data:image/png;base64" in metadata["history"]
+    assert "data:image/png;base64" in metadata["history_chart"]
     assert holder_of_the_alias(benchmark) == run_of(benchmark, "mine_k01"), (
         "MLflow's champion is who is champion from now on"
     )
@@ -171,7 +175,10 @@ def test_the_champion_is_promoted_watched_and_told_of(made):
     assert (first.promotion["verdict"], second.promotion, second.named) == ("better", None, "mean_action")
     assert len({line.table for line in (first, second, third)}) == 3
     assert {row["policy"] for row in second.rows} == {row["policy"] for row in table["policies"]}
-    page = (benchmark.store.dataset("tiny") / "benchmark_history" / "history.html").read_text(encoding="utf-8")
+    with FileServer(benchmark.store, 0) as server:
+        address = urlsplit(metadata["history"])  # as Dagster links to it; another port while it is served here
+        assert address.port == FILES_PORT
+        page = urlopen(f"http://127.0.0.1:{server.server_port}{address.path}", timeout=30).read().decode()
     assert page.count("<tr>") == 4
     assert first.content_hash[:12] in page
     assert not (benchmark.store.root / LOG).exists()

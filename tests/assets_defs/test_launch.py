@@ -66,6 +66,7 @@ def test_a_run_says_who_makes_it_and_where_its_results_are_seen(finished):
         table = instance.get_latest_materialization_event(dg.AssetKey(["benchmark_table"])).asset_materialization
     assert run.tags[PID_TAG] == str(os.getpid())
     assert run.tags["demobench/report"] == "http://127.0.0.1:3001/tiny/benchmark_report/report.html"
+    assert run.tags["demobench/history"] == "http://127.0.0.1:3001/tiny/benchmark_history/history.html"
     assert run.tags["demobench/mlflow"].startswith("http://127.0.0.1:5000/#/experiments/")
     assert run.tags["demobench/mlflow"].endswith("/runs")
     assert {name: table.metadata[name].value for name in ("report", "mlflow")} == {

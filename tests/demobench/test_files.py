@@ -18,6 +18,11 @@ def server(tmp_path_factory):
     report.mkdir()
     (report / "report.html").write_text(PAGE)
     (report / "made.json").write_text("{}")
+    entry = store.folder("tape+1", "benchmark_history", "000001")
+    entry.mkdir(parents=True)
+    (entry / "made.json").write_text("secret")
+    (entry.parent / "history.html").write_text(PAGE)
+    (entry.parent / "history.png").write_text("secret")
     (store.root / "secret.html").write_text("secret")
     (report / "away.html").symlink_to(store.root.parent / "away.html")
     (store.root.parent / "away.html").write_text("secret")
@@ -49,10 +54,17 @@ def test_a_report_is_shown_whole(server):
     assert ask(server, "/tape+1/benchmark_report/report.html", "HEAD")[:2] == (200, "")
 
 
+def test_a_history_is_shown_whole(server):
+    status, body, headers = ask(server, "/tape%2B1/benchmark_history/history.html")
+    assert (status, body) == (200, PAGE)
+    assert headers["Content-Type"] == "text/html; charset=utf-8"
+
+
 def test_the_first_page_lists_what_there_is(server):
     status, body, _ = ask(server, "/")
     assert status == 200
     assert '<a href="/tape%2B1/benchmark_report/report.html">report</a>' in body
+    assert '<a href="/tape%2B1/benchmark_history/history.html">history</a>' in body
     assert "secret" not in body
 
 
@@ -71,6 +83,9 @@ def test_the_first_page_lists_what_there_is(server):
         "/tape+1/mlp_k01%2ftrained_policy%2fstate/page.html",
         "/tape+1/benchmark_report/report.html%00",
         "/nothing/benchmark_report/report.html",
+        "/tape+1/benchmark_history/history.png",
+        "/tape+1/benchmark_history/000001/made.json",
+        "/tape+1/benchmark_history/000001",
     ],
 )
 def test_nothing_else_is_shown(server, address):

@@ -1,5 +1,6 @@
 """Fixtures for everything that writes files: a small data set with what was predicted and rolled out on it."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -66,3 +67,18 @@ def rollouts() -> Rollouts:
         "pusht", "0.1.8", "mlp_k04", "state", np.arange(6), success, np.where(success, 1.0, 0.4),
         np.where(success, 0.96, 0.4), np.full(6, 20), paths,
     )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A real Chromium without a window."""
+    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if program is None:
+        pytest.skip("no Chromium on this machine")
+    from playwright.sync_api import sync_playwright
+
+    flags = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--disable-background-networking", "--disable-sync"]
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=program, args=flags)
+        yield opened
+        opened.close()
