@@ -127,6 +127,35 @@ def test_the_ui_runs_the_command_lines_run_again(served):
     assert after == before, "nothing was stale, so the second run made nothing again"
 
 
+TICKS = """
+{
+  sensorsOrError(repositorySelector: {repositoryName: "__repository__", repositoryLocationName: "demobench"}) {
+    ... on Sensors { results { name sensorState { ticks(limit: 1) { status } } } }
+  }
+}"""
+
+
+def has_ticked(address: str, sensor: str) -> bool:
+    found = graphql(address, TICKS)["sensorsOrError"].get("results", [])
+    return any(one["name"] == sensor and one["sensorState"]["ticks"] for one in found)
+
+
+def test_a_run_of_the_command_line_that_fails_is_a_line_in_the_log(served):
+    place, dagster, _ = served
+    broken = write_v3(place / "broken", tiny_recording(episodes=6, frames=40))
+    (data,) = broken.glob("data/*/*.parquet")
+    data.write_bytes(data.read_bytes()[:200])
+    wait_for(lambda: has_ticked(dagster, "run_failed"), 120)  # what failed before its first tick it does not tell
+    command = [sys.executable, "-m", "demobench.cli", "run", "broken"]
+    assert subprocess.run(command, cwd=place, capture_output=True, timeout=300, check=False).returncode == 2
+    log = place / "results" / "automation.log"
+    wait_for(log.exists, 120)
+    (failed,) = [run for run in runs(dagster) if run["partition"] == "broken"]
+    (line,) = log.read_text(encoding="utf-8").splitlines()
+    assert f" UTC broken failed: demonstrations: {data} cannot be read as parquet" in line
+    assert line.endswith(f"(run {failed['runId'][:8]}; to see more: demobench ui, Runs, {failed['runId'][:8]})")
+
+
 @pytest.fixture(scope="module")
 def window():
     """A page of a real browser, and what any page that it opened complained about."""
