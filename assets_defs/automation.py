@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from threading import Thread
 from typing import Any
 
 import dagster as dg
@@ -97,8 +98,12 @@ def _weekly(config: Config, job: Any) -> dg.ScheduleDefinition:
         requests = requests_for(workbench, keys, context.log.warning, lambda key: f"{key}@{tick}")
         if requests:
             yield from requests
-        else:
+        elif keys:
             yield dg.SkipReason("every data set is up to date")
+        else:
+            yield dg.SkipReason(
+                "no data set of the configuration is a partition yet; the sensor register_datasets makes them"
+            )
 
     return weekly_rebenchmark
 
@@ -116,24 +121,26 @@ def _new_revision(job: Any) -> dg.SensorDefinition:
     ) -> dg.SensorResult | dg.SkipReason:
         seen = json.loads(context.cursor or "{}")
         ready = set(context.instance.get_dynamic_partitions(str(PARTITIONS.name)))
-        found = {key: commit for key, commit in _commits(workbench.config) if key in ready and seen.get(key) != commit}
+        commits = {key: commit for key, commit in _commits(workbench.config) if key in ready}
+        found = {key: commit for key, commit in commits.items() if commit is not None and seen.get(key) != commit}
         if not found:
-            return dg.SkipReason("no data set of the Hub has moved")
+            silent = [key for key, commit in commits.items() if commit is None]
+            again = f"; asked again at the next tick, as the Hub did not say: {', '.join(silent)}" if silent else ""
+            return dg.SkipReason(f"no data set of the Hub has moved{again}")
         requests = requests_for(workbench, found, context.log.warning, lambda key: f"{key}@{found[key]}")
         return dg.SensorResult(run_requests=requests, cursor=json.dumps(seen | found))
 
     return new_hub_revision
 
 
-def _commits(config: Config) -> Iterator[tuple[str, str]]:
-    """The data sets of the Hub with the commit that their revision stands for now; those that cannot be asked are left out."""
-    from pipeline.lerobot_format.hub import current_commit, parse_repository
+def _commits(config: Config) -> Iterator[tuple[str, str | None]]:
+    """The data sets of the Hub with the commit that their revision stands for now; None where the Hub does not say. What the
+    cache saw last is no answer: it may be older than what was seen here, and would be taken for a move back."""
+    from pipeline.lerobot_format.hub import commit_by_hub, parse_repository
 
     for key, dataset in config.datasets.items():
         if dataset.source.startswith("hub:"):
-            commit = current_commit(*parse_repository(dataset.source.removeprefix("hub:")))
-            if commit is not None:
-                yield key, commit
+            yield key, commit_by_hub(*parse_repository(dataset.source.removeprefix("hub:")))
 
 
 @dg.sensor(
@@ -161,7 +168,11 @@ def register_datasets(context: dg.SensorEvaluationContext, workbench: dg.Resourc
     "wrong, how to see more), and tells whoever [notify] names.",
 )
 def run_failed(context: dg.RunFailureSensorContext, workbench: dg.ResourceParam[Workbench]) -> None:
-    """One line, one message."""
+    """One line, one message.
+
+    Dagster gives the sensor 60 s for up to five runs, and tells it of all of them again where it takes longer; a message may take
+    half a minute. So it is sent beside the tick.
+    """
     from pipeline.notify import log_line, message, send
 
     run = context.dagster_run
@@ -171,7 +182,8 @@ def run_failed(context: dg.RunFailureSensorContext, workbench: dg.ResourceParam[
         workbench.store.root,
         f"{dataset} failed: {words} (run {run.run_id[:8]}; to see more: demobench ui, Runs, {run.run_id[:8]})",
     )
-    send(workbench.config.notify, message("failure", dataset, words, run_id=run.run_id), workbench.store.root)
+    told = message("failure", dataset, words, run_id=run.run_id)
+    Thread(target=send, args=(workbench.config.notify, told, workbench.store.root), name=f"tell {run.run_id}").start()
 
 
 def failure_words(events: Sequence[dg.DagsterEvent]) -> str:

@@ -147,12 +147,17 @@ def _fetch(text: str, kind: _Kind, patterns: list[str]) -> HubCopy:
 
 def current_commit(repository: str, revision: str | None) -> str | None:
     """The commit that a revision stands for now: by the Hub, else as the cache last saw it, else None. Never raises."""
+    return commit_by_hub(repository, revision) or _cached_commit(repository, revision)
+
+
+def commit_by_hub(repository: str, revision: str | None) -> str | None:
+    """The commit that a revision stands for now; None where the Hub does not say. A commit stands for itself. Never raises."""
     if revision and _COMMIT.fullmatch(revision):
         return revision
     try:
         return _ask(DATA_SET, repository, revision, None, TIMEOUT_S / 3)
     except (_OutOfReach, HubError):
-        return _cached_commit(repository, revision)
+        return None
 
 
 def _ask(kind: _Kind, repository: str, revision: str | None, patterns: list[str] | None, timeout: float) -> str:

@@ -2,7 +2,9 @@
 
 import json
 import re
-from datetime import UTC, datetime
+import threading
+import time
+from datetime import UTC, datetime, timedelta
 from itertools import takewhile
 
 import dagster as dg
@@ -10,19 +12,21 @@ import pytest
 from dagster._core.definitions.partitions.context import partition_loading_context
 from dagster._utils.schedules import schedule_execution_time_iterator
 
-from assets_defs.automation import register_datasets, run_failed
+from assets_defs.automation import _commits, register_datasets, run_failed
 from assets_defs.benchmark import gate_words
 from assets_defs.definitions import build_defs
 from assets_defs.launch import open_instance, run_benchmark
 from assets_defs.resources import Workbench
 from pipeline.config import parse_config
 from pipeline.experiment import variants
-from pipeline.notify import LOG
+from pipeline.lerobot_format.hub import fetch
+from pipeline.notify import LOG, send
 from pipeline.statistics.regression import FALSE_ALARMS_AT_MOST
 from pipeline.store import Made, Store
 from tests.assets_defs.conftest import TINY, TinyBenchmark
 from tests.lerobot_format.hub_server import running_hub
 from tests.makers import tiny_recording, write_v3
+from tests.test_notify import listening
 
 MONDAY = datetime(2026, 3, 2, 3, 0, tzinfo=UTC)
 
@@ -108,6 +112,10 @@ def on_hub(tmp_path, monkeypatch):
         yield hub, tick
 
 
+def commit_of(hub) -> str:
+    return hub.repositories["owner/tiny"].refs["main"]
+
+
 def test_a_revision_that_moves_asks_for_a_run_once(on_hub, tmp_path):
     hub, tick = on_hub
     first = tick(None)
@@ -121,10 +129,40 @@ def test_a_revision_that_moves_asks_for_a_run_once(on_hub, tmp_path):
     assert dg.AssetKey(["demonstrations"]) in second.run_requests[0].asset_selection
 
 
-def test_a_hub_out_of_reach_is_no_news(on_hub):
+def test_a_hub_out_of_reach_is_asked_again_and_the_cursor_is_kept(on_hub, tmp_path):
     hub, tick = on_hub
     hub.failure = 503
-    assert "no data set of the Hub has moved" in tick(None).skip_message
+    silent = tick(None)
+    assert not silent.run_requests
+    assert silent.skip_message == (
+        "no data set of the Hub has moved; asked again at the next tick, as the Hub did not say: tiny"
+    )
+    hub.failure = None
+    first = tick(silent.cursor)
+    assert [r.run_key for r in first.run_requests] == [f"tiny@{commit_of(hub)}"]
+    hub.failure = 503
+    assert tick(first.cursor).cursor == first.cursor
+    hub.failure = None
+    assert not tick(tick(first.cursor).cursor).run_requests, "it was asked for once"
+
+
+def test_a_hub_out_of_reach_does_not_move_a_data_set_back_to_what_the_cache_holds(on_hub, tmp_path):
+    hub, tick = on_hub
+    fetch("owner/tiny")
+    commit = hub.push("owner/tiny", write_v3(tmp_path / "second", tiny_recording(6, 30, seed=1)))
+    moved = tick(None)
+    assert [r.run_key for r in moved.run_requests] == [f"tiny@{commit}"]
+    hub.failure = 503
+    later = tick(moved.cursor)
+    assert not later.run_requests
+    assert later.cursor == moved.cursor
+
+
+def test_a_data_set_that_the_hub_does_not_know_does_not_keep_the_others_from_theirs(on_hub, tmp_path):
+    hub, _ = on_hub
+    sources = {"gone": {"source": "hub:owner/gone"}, "tiny": {"source": "hub:owner/tiny"}}
+    config = parse_config({"datasets": sources, "policies": TINY["policies"]}, "test")
+    assert dict(_commits(config)) == {"gone": None, "tiny": commit_of(hub)}
 
 
 def test_a_data_set_that_is_gone_does_not_keep_the_others_from_their_runs(fresh, tmp_path):
@@ -155,7 +193,11 @@ def test_the_schedule_ticks_on_mondays_at_three_utc_and_runs_what_is_stale_then(
     assert [next(ticks).isoformat() for _ in range(3)] == [
         "2026-03-02T03:00:00+00:00", "2026-03-09T03:00:00+00:00", "2026-03-16T03:00:00+00:00",
     ]  # fmt: skip
+    a_second = timedelta(seconds=1)
+    for moment, due in ((MONDAY - a_second, MONDAY), (MONDAY + a_second, MONDAY + timedelta(days=7))):
+        assert next(schedule_execution_time_iterator(moment.timestamp(), schedule.cron_schedule, "UTC")) == due
     with open_instance(fresh.store.root) as instance:
+        assert "register_datasets makes them" in schedule_tick(fresh, instance, MONDAY).skip_message
         instance.add_dynamic_partitions("datasets", ["tiny"])
         (request,) = schedule_tick(fresh, instance, MONDAY).run_requests
     assert request.partition_key == "tiny"
@@ -217,9 +259,17 @@ def failed(tmp_path, monkeypatch):
         yield benchmark, run, tell, told
 
 
+def wait_for_messages() -> None:
+    """Messages are sent beside the tick."""
+    for thread in [thread for thread in threading.enumerate() if thread.name.startswith("tell ")]:
+        thread.join(60)
+        assert not thread.is_alive()
+
+
 def test_a_failed_run_is_one_line_and_one_message_without_a_token(failed):
     benchmark, run, tell, told = failed
     tell()
+    wait_for_messages()
     (line,) = (benchmark.store.root / LOG).read_text(encoding="utf-8").splitlines()
     short = run.run_id[:8]
     assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC tiny failed: demonstrations: ", line)
@@ -233,13 +283,29 @@ def test_a_failed_run_is_one_line_and_one_message_without_a_token(failed):
 
 
 def test_nobody_who_can_be_told_is_one_more_line(failed, monkeypatch):
-    monkeypatch.setattr("pipeline.notify.PAUSE_S", 0.0)
+    monkeypatch.setitem(send.__kwdefaults__, "pause_s", 0.0)
     benchmark, _, tell, _ = failed
     benchmark.raw = benchmark.raw | {"notify": {"command": ["/nowhere/tell"]}}
     tell(benchmark)
+    wait_for_messages()
     lines = (benchmark.store.root / LOG).read_text(encoding="utf-8").splitlines()
     assert len(lines) == 2
     assert "the command tell was not told of the failure of tiny: it cannot be started" in lines[1]
+
+
+def test_a_webhook_that_never_answers_does_not_hold_up_the_sensor(failed, monkeypatch):
+    monkeypatch.setitem(send.__kwdefaults__, "timeout_s", 1.0)
+    benchmark, run, tell, _ = failed
+    with listening(stall_s=30) as (url, got):
+        benchmark.raw = benchmark.raw | {"notify": {"webhook": url}}
+        start = time.monotonic()
+        tell(benchmark)
+        assert time.monotonic() - start < 3 * 1.0, "less than three tries take"
+        wait_for_messages()
+    assert len(got) == 3
+    lines = (benchmark.store.root / LOG).read_text(encoding="utf-8").splitlines()
+    assert [run.run_id[:8] in line for line in lines] == [True, False]
+    assert lines[1].endswith("was not told of the failure of tiny: no answer within 1 s, 3 tries")
 
 
 def test_the_sensors_that_only_look_and_write_run_by_default(fresh):
