@@ -12,7 +12,7 @@ from assets_defs.plan import Plan, Unit
 from assets_defs.resources import Workbench, asset_keys
 from pipeline import errors
 from pipeline.config import Config
-from pipeline.errors import DemobenchError
+from pipeline.errors import ConfigError, DemobenchError
 from pipeline.experiment import Variant
 
 BENCHMARK = "benchmark"
@@ -55,6 +55,22 @@ def automation(config: Config, policies: Sequence[Variant]) -> dict[str, list[An
         "schedules": [_weekly(config, rebenchmark)],
         "sensors": [register_datasets, _new_revision(rebenchmark), run_failed],
     }
+
+
+def check_cron(config: Config) -> None:
+    """Whether Dagster can work out when it is time.
+
+    Raises:
+        ConfigError: the cron line is none, or stands for a day that never comes.
+    """
+    cron = config.schedule.cron
+    try:
+        dg.ScheduleDefinition(cron_schedule=cron, job_name=REBENCHMARK)
+    except dg.DagsterInvalidDefinitionError:
+        raise ConfigError(
+            f"[schedule] cron is '{cron}', which is no time. Write minute, hour, day of the month, month and day of the week with "
+            'spaces between, for example "0 3 * * 1" (Mondays at 03:00 UTC), or a word like "@weekly".'
+        ) from None
 
 
 def stale_assets(workbench: Workbench, key: str) -> list[dg.AssetKey]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import dagster as dg
 
 from assets_defs import data, floor
-from assets_defs.automation import automation
+from assets_defs.automation import automation, check_cron
 from assets_defs.benchmark import benchmark_assets
 from assets_defs.curve import curve_assets
 from assets_defs.elsewhere import KEY as SCORED
@@ -41,7 +41,12 @@ def build_defs(
     ----------
     progress : told what assets are doing; the log is used without it.
     experiments : settings by partition key that the command line resolved; they take precedence over the file's.
+
+    Raises
+    ------
+    ConfigError : the schedule's cron line is none.
     """
+    check_cron(config)
     experiments = dict(experiments or {})
     families = dict(BASELINES) | dict(config.policies)
     for experiment in experiments.values():

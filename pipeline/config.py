@@ -16,7 +16,6 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_serializer, model_validator
 
-from pipeline.cron import WORDS, problem_of
 from pipeline.errors import ConfigError, did_you_mean
 from pipeline.execution import settled
 from pipeline.methods import DERIVED, HINDSIGHT, METHODS, SYMMETRIES, is_own
@@ -263,16 +262,6 @@ class PolicyConfig(Settings):
 
 class ScheduleConfig(Settings):
     cron: str = "0 3 * * 1"
-
-    @model_validator(mode="after")
-    def _cron_is_a_time(self):
-        problem = problem_of(self.cron)
-        if problem is not None:
-            raise ConfigError(
-                f"[schedule] cron is '{self.cron}', and {problem}. Write minute, hour, day of the month, month and day of the week "
-                f'with spaces between, for example "0 3 * * 1" (Mondays at 03:00 UTC), or one of {", ".join(WORDS)}.'
-            )
-        return self
 
 
 class NotifyConfig(Settings):

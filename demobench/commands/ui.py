@@ -23,9 +23,12 @@ def serve(port: int, mlflow_port: int, files_port: int, config_path: Path | None
     """Start the servers and wait; Ctrl-C or SIGTERM stops them.
 
     Raises:
-        DemobenchError: a port is in use, or a server ended by itself.
+        DemobenchError: a port is in use, a server ended by itself, or the schedule's cron line is none.
     """
+    from assets_defs.automation import check_cron
+
     session = open_session(config_path, store_path)
+    check_cron(session.config)
     session.store.ensure()
     sqlite = session.config.tracking.mlflow == "sqlite"
     wanted = {"--port": port, "--files-port": files_port} | ({"--mlflow-port": mlflow_port} if sqlite else {})

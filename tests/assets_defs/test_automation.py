@@ -18,6 +18,7 @@ from assets_defs.definitions import build_defs
 from assets_defs.launch import open_instance, run_benchmark
 from assets_defs.resources import Workbench
 from pipeline.config import parse_config
+from pipeline.errors import ConfigError
 from pipeline.experiment import variants
 from pipeline.lerobot_format.hub import fetch
 from pipeline.notify import LOG, send
@@ -212,6 +213,15 @@ def test_another_time_is_a_setting(fresh):
     (gate,) = [spec for spec in specs if spec.name == "champion_not_worse"]
     assert not gate.blocking
     assert gate.description == gate_words("30 1 * * *")
+
+
+@pytest.mark.parametrize("cron", ["", "weekly", "0 3 * *", "0 0 3 * * 1", "0 24 * * *", "0 3 30 2 *", "@mondays"])
+def test_a_cron_line_that_is_none_is_one_message(cron, tmp_path):
+    config = parse_config({"schedule": {"cron": cron}}, "test")
+    with pytest.raises(
+        ConfigError, match=re.escape(f"[schedule] cron is '{cron}', which is no time. Write minute, hour")
+    ):
+        build_defs(config, config_dir=tmp_path)
 
 
 @pytest.mark.parametrize(
