@@ -14,6 +14,7 @@ What belongs here: paths, fingerprints, atomic replacement, locks. What does not
 
 import json
 import os
+import re
 import shutil
 import time
 from collections.abc import Iterator, Mapping
@@ -27,6 +28,8 @@ from pipeline.errors import StoreError
 
 MADE = "made.json"
 EXPERIMENT = "experiment.json"
+DRAFT = re.compile(r"\..+\.([0-9]+)\.draft(\.\w+)?")
+"""What is being written is called `.<name>.<process>.draft`, and of a file how it ends."""
 LEAST_FREE_MB = 100
 """Below this much free space no run is started: the databases of Dagster and MLflow alone take tens of MB."""
 
@@ -52,7 +55,7 @@ class Store:
         self.root = Path(root).expanduser().absolute()
 
     def ensure(self) -> "Store":
-        """Create the folder, and check that it can be written to before any work is done."""
+        """Create the folder, check that it can be written to before any work is done, and remove what killed processes left."""
         try:
             self.root.mkdir(parents=True, exist_ok=True)
             probe = self.root / f".probe-{os.getpid()}"
@@ -69,7 +72,21 @@ class Store:
                 f"There is no room for results at {self.root}: {free_mb:.0f} MB are free, and a benchmark needs at least "
                 f"{LEAST_FREE_MB}. Free some space or choose another folder with --store."
             )
+        self._sweep()
         return self
+
+    def _sweep(self) -> None:
+        """Remove the drafts of processes that are gone: one that is killed cannot clean up behind itself."""
+        import psutil
+
+        for place in (self.root / "datasets", self.root / "mlflow_unsent"):
+            for folder, folders, files in os.walk(place):
+                for name in (*folders, *files):
+                    found = DRAFT.fullmatch(name)
+                    if found and not psutil.pid_exists(int(found[1])):
+                        left = Path(folder) / name
+                        with suppress(OSError):
+                            shutil.rmtree(left) if left.is_dir() else left.unlink()
 
     def dataset(self, key: str) -> Path:
         """The folder of one partition. The key is checked, so that no name can walk out of the store."""

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import subprocess
 import time
 
 import psutil
@@ -57,6 +58,21 @@ def test_a_process_that_died_between_the_renames_loses_nothing(store):
     folder.rename(folder.with_name(".windows.old"))
     assert store.made(folder) == Made("f1")
     assert (folder / "value.txt").read_text() == "one"
+
+
+def test_what_a_killed_process_was_writing_is_removed_at_the_next_start(store):
+    folder = store.folder("tape", "mlp_k01/predictions", "state")
+    publish(store, folder, "one")
+    gone, kept = subprocess.Popen(["true"]), os.getpid()
+    gone.wait()
+    for pid in (gone.pid, kept):
+        (folder.parent / f".state.{pid}.draft").mkdir()
+        (folder.parent / f".state.{pid}.draft" / "value.txt").write_text("half")
+        (store.dataset("tape") / f".experiment.{pid}.draft.json").write_text("{")
+    store.ensure()
+    assert {p.name for p in folder.parent.iterdir()} == {"state", f".state.{kept}.draft"}
+    assert {p.name for p in store.dataset("tape").glob(".*")} == {f".experiment.{kept}.draft.json"}
+    assert store.is_fresh(folder, "f1")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes anywhere; the file in the way below covers it")
