@@ -24,7 +24,8 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from assets_defs.plan import Unit
-from pipeline.sinks.to_mlflow import find_experiment, tracking_uri
+from pipeline.sinks.mlflow_outbox import Outbox
+from pipeline.sinks.to_mlflow import VIEW
 from pipeline.store import Store
 
 HERE = Path(__file__).resolve().parent / "images"
@@ -70,26 +71,35 @@ def report_phone(scene: Scene, path: Path) -> None:
 
 
 def graph(scene: Scene, path: Path) -> None:
-    page = scene.page(1500, 1000)
+    page = scene.page(1900, 2100)  # groups show how many of their assets are made where there is room for it
     page.goto(f"{scene.dagster}/asset-groups")
-    page.get_by_text("looking", exact=True).locator("visible=true").last.wait_for()
+    outermost = [
+        page.get_by_text(name, exact=True).locator("visible=true").last
+        for name in ("data", "floor", "elsewhere", "looking")
+    ]
+    outermost[-1].wait_for()
     page.wait_for_timeout(3000)  # the graph glides into its place
-    page.screenshot(path=path, clip={"x": 541, "y": 110, "width": 915, "height": 890})
+    left, top, bottom, right = (group.bounding_box() for group in outermost)
+    width, height = right["x"] - left["x"] + 320, bottom["y"] - top["y"] + 140
+    page.screenshot(path=path, clip={"x": left["x"] - 40, "y": top["y"] - 40, "width": width, "height": height})
 
 
 def asset(scene: Scene, path: Path) -> None:
     page = scene.page(1500, 1000)
-    page.goto(f"{scene.dagster}/assets/mlp_k16/predictions?partition=pusht_sim")
+    page.goto(f"{scene.dagster}/assets/mlp_k16/predictions?view=partitions&partition=pusht_sim")
     page.get_by_text("Show Markdown").last.click()
     page.locator("img[src^='data:image/png']").first.wait_for()
     page.screenshot(path=path)
 
 
 def mlflow(scene: Scene, path: Path) -> None:
-    page = scene.page(1500, 1000)
-    experiment = find_experiment(tracking_uri("sqlite", scene.store.root), "pusht_sim")
-    page.goto(f"{scene.mlflow}/#/experiments/{experiment}/runs?compareRunsMode=CHART")
+    page = scene.page(1600, 1000)
+    experiment = Outbox(scene.store, "sqlite").experiment_id("pusht_sim")
+    view = f"viewStateShareKey={VIEW}&compareRunsMode=CHART"
+    page.goto(f"{scene.mlflow}/#/experiments/{experiment}/runs?{view}")
     page.get_by_text("first_step_mae").first.wait_for()
+    for close in page.get_by_role("button", name="Close").all():  # MLflow's assistant, and what it says of shared views
+        close.click()
     page.wait_for_timeout(3000)  # charts draw themselves one after another
     page.screenshot(path=path)
 
