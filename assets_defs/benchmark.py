@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 TABLE = dg.AssetKey(["benchmark_table"])
 REPORT = dg.AssetKey(["benchmark_report"])
 REGRESSION = "champion_not_worse"
+ROWS = "policies.csv"
+"""The table's rows for spreadsheets, and for MLflow, which shows such files as tables."""
 
 
 def benchmark_assets(
@@ -133,6 +135,7 @@ def _history_metadata(bench: Bench, line: "Line") -> dict[str, Any]:
 
 
 def _write_table(bench: Bench, draft) -> Outcome:
+    from pipeline.sinks.rows_csv import write_rows
     from pipeline.statistics.floors import load_estimates
     from pipeline.statistics.metrics import load_errors
     from pipeline.statistics.radius import load_floors
@@ -165,6 +168,7 @@ def _write_table(bench: Bench, draft) -> Outcome:
     built = build_table(facts, experiment, bench.split, floors, estimates, entries, modes)
     built["key"] = plan.key
     write_json(draft / "table.json", built)
+    write_rows(built["policies"], draft / ROWS)
     rows = [
         (
             row["policy"],
@@ -176,15 +180,30 @@ def _write_table(bench: Bench, draft) -> Outcome:
         )
         for row in built["policies"]
     ]
-    names = {row["policy"] for row in built["policies"]}
+    still = any(row["policy"] == "hold_still" for row in built["policies"])
     hashes = {entry["split_hash"] for entry in entries}
     return Outcome(
         {"rows": rows},
         {
-            "baselines_present": ("hold_still" in names, f"{len(rows)} rows"),
+            "baselines_present": (
+                still,
+                f"{len(rows)} rows"
+                if still
+                else "hold_still/predictions is missing or out of date: materialise it first",
+            ),
             "same_data": (hashes == {bench.split.hash}, f"split {bench.split.hash[:16]}"),
         },
+        [about_benchmark(bench, [ROWS, "table.json"])],
     )
+
+
+def about_benchmark(bench: Bench, files: Sequence[str]) -> "Message":
+    """Files of the table or of its report for the MLflow run of the table that is there now."""
+    from pipeline.sinks.to_mlflow import Message, benchmark_card
+
+    made_from = bench.plan.fingerprint(Unit("benchmark_table"))
+    card = benchmark_card(bench.experiment, bench.demonstrations, bench.split, bench.plan.key, made_from)
+    return Message(card, files=list(files))
 
 
 def _rolled_out(bench: Bench, unit: Unit) -> dict:
@@ -319,4 +338,5 @@ def _write_report(bench: Bench, draft) -> Outcome:
     return Outcome(
         {"size_mb": round(page.stat().st_size / 1e6, 2)},
         {"self_contained": (not outside, "; ".join(outside) or "no outside reference")},
+        [about_benchmark(bench, ["report.html", "errors.png"])],
     )

@@ -81,8 +81,11 @@ def mlflow_links(bench: Bench, made: Mapping[str, Made]) -> dict[str, dg.Metadat
 
 
 def experiment_link(bench: Bench, experiment_id: str | None) -> str:
-    """The address of all MLflow runs of a data set side by side; of all experiments where its own is not known."""
-    return f"{_mlflow(bench)}/#/experiments" + (f"/{quote(experiment_id)}/runs" if experiment_id else "")
+    """The address of all policies of a data set side by side in MLflow; of all experiments where its own is not known."""
+    from pipeline.sinks.to_mlflow import VIEW
+
+    view = f"/{quote(experiment_id)}/runs?viewStateShareKey={VIEW}&compareRunsMode=CHART" if experiment_id else ""
+    return f"{_mlflow(bench)}/#/experiments{view}"
 
 
 def _mlflow(bench: Bench) -> str:

@@ -31,7 +31,7 @@ CODE_VERSIONS = {
     "predictions": "3",
     "rollouts": "4",
     "scored_predictions": "2",
-    "benchmark_table": "7",
+    "benchmark_table": "8",
     "benchmark_report": "10",
     "rollout_video": "1",
     "mcap_log": "2",

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import StoreError, printable
-from pipeline.sinks.to_mlflow import Message, RunCard, Series, tracking_uri, without_secret
+from pipeline.sinks.to_mlflow import VIEW, Message, RunCard, Series, experiment_tags, tracking_uri, without_secret
 from pipeline.store import Store, drafted
 
 BATCH = 1000
@@ -229,13 +229,19 @@ def _answers(client: Any) -> bool:
 
 
 def _experiment_id(client: Any, uri: str, name: str) -> str:
+    """The experiment of that name, opened where there is none, with the view that links lead to."""
+    wanted = experiment_tags()
     found = client.get_experiment_by_name(name)
     if found is not None:
+        # A note may be the user's by now; the view is ours.
+        for key, value in wanted.items():
+            if key not in found.tags or (key.endswith(VIEW) and found.tags[key] != value):
+                client.set_experiment_tag(found.experiment_id, key, value)
         return found.experiment_id
     if not uri.startswith("sqlite:///"):
-        return client.create_experiment(name)
+        return client.create_experiment(name, tags=wanted)
     artifacts = Path(uri.removeprefix("sqlite:///")).parent / "mlartifacts"
-    return client.create_experiment(name, artifact_location=artifacts.as_uri())
+    return client.create_experiment(name, artifact_location=artifacts.as_uri(), tags=wanted)
 
 
 def _find_run(client: Any, uri: str, card: RunCard) -> Any:

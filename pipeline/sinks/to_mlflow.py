@@ -4,19 +4,37 @@ What belongs here: names of parameters, metrics and tags, and messages that hold
 not: computing any of them, and sending them (`mlflow_outbox`), which may have to wait until MLflow can be reached.
 """
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline.experiment import Experiment
 from pipeline.folds import PolicyTask
+from pipeline.types import Demonstrations, Split
 
 Series = Mapping[str, Sequence[tuple[int, float]]]
 """Metric → (step, value) pairs."""
 
 CHAMPION = "champion"
 """The alias in the model registry."""
+VIEW = "demobench"
+"""The name of the view of an experiment that links lead to: MLflow keeps such views as tags of the experiment."""
+NOTE = """One run a policy × observation set, its training seeds as nested runs; one run `benchmark` a table, with the report.
+
+`first_step_mae` is the error of the first action on held-out episodes; of `error_by_horizon` the step is how many actions ahead;
+`rollout_…` is closed loop. Intervals, and what is better than chance, are in the report."""
+COMPARED = (
+    "first_step_mae",
+    "error_by_horizon",
+    "vs_hold_still",
+    "at_one_second_mae",
+    "rollout_success",
+    "rollout_score",
+)
+"""The charts of the view, in order; MLflow's own are all metrics by the alphabet. Errors of whole chunks cannot be compared."""
 
 
 def tracking_uri(setting: str, store_root: Path) -> str:
@@ -28,6 +46,45 @@ def without_secret(uri: str) -> str:
     """The address without a user and password that somebody may have put into it."""
     scheme, _, rest = uri.partition("://")
     return f"{scheme}://{rest.rpartition('@')[2]}"
+
+
+def experiment_tags() -> dict[str, str]:
+    """What a data set's experiment says about itself, and how its policies are compared: the best first, without seeds."""
+    charts = [
+        {
+            "uuid": f"{VIEW}-{metric}",
+            "type": "LINE" if metric.endswith("by_horizon") else "BAR",
+            "metricKey": metric,
+            "selectedMetricKeys": [metric],
+            "displayName": metric,
+            "metricSectionId": VIEW,
+            "runsCountToCompare": 50,
+            "xAxisKey": "step",
+            "useGlobalXaxisKey": True,
+            "lineSmoothness": 0,
+            "scaleType": "linear",
+            "deleted": False,
+            "isGenerated": False,
+        }
+        for metric in COMPARED
+    ]
+    section = {"uuid": VIEW, "name": "Policies", "display": True, "isReordered": False, "deleted": False}
+    view = {
+        "compareRunCharts": charts,
+        "compareRunSections": [section | {"isGenerated": False}],
+        "isAccordionReordered": False,
+        "runsHiddenMode": "SHOW_ALL",
+        "searchFilter": "params.`policy` != ''",  # seeds have no parameters
+        "orderByKey": "metrics.`first_step_mae`",
+        "orderByAsc": True,
+        "selectedColumns": [
+            "params.`chunk`",
+            "params.`seeds`",
+            "params.`steps`",
+            *(f"metrics.`{m}`" for m in COMPARED),
+        ],
+    }
+    return {"mlflow.note.content": NOTE, f"mlflow.sharedViewState.{VIEW}": json.dumps(view)}
 
 
 @dataclass(frozen=True)
@@ -102,23 +159,42 @@ def run_card(
         **{f"settings.{key}": value for key, value in task.policy.settings.items()},
         **(changes or {}),
     }
-    about = {
-        "content_hash": demos.content_hash,
-        "split_hash": task.split.hash,
-        "revision": demos.revision or "",
-        "data_set": demos.name,
-        "excluded": ", ".join(map(str, demos.excluded))[:5000],
-        **(tags or {}),
-    }
-    facts = {"episodes": demos.episodes, "frames": demos.frames, "fps": demos.fps, "content_hash": demos.content_hash}
     return RunCard(
         experiment=experiment,
         name=f"{variant.name}/{task.observation_set.name}",
         fingerprint=fingerprint,
         params={key: str(value) for key, value in params.items()},
-        tags={key: str(value) for key, value in about.items()},
-        dataset={"name": demos.name, "source": demos.source, "revision": demos.revision, "facts": facts},
+        tags=_tags_of(demos, task.split.hash) | {key: str(value) for key, value in (tags or {}).items()},
+        dataset=_dataset_of(demos),
     )
+
+
+def benchmark_card(experiment: Experiment, demos: Demonstrations, split: Split, key: str, fingerprint: str) -> RunCard:
+    """The run of one table. It has no policy, so that comparisons of policies leave it out."""
+    params = {name: getattr(experiment, name) for name in ("protocol", "seeds", "steps", "history")}
+    return RunCard(
+        experiment=key,
+        name="benchmark",
+        fingerprint=fingerprint,
+        params={name: str(value) for name, value in (params | {"folds": len(split.folds)}).items()},
+        tags=_tags_of(demos, split.hash),
+        dataset=_dataset_of(demos),
+    )
+
+
+def _tags_of(demos: Demonstrations, split_hash: str) -> dict[str, str]:
+    return {
+        "content_hash": demos.content_hash,
+        "split_hash": split_hash,
+        "revision": demos.revision or "",
+        "data_set": demos.name,
+        "excluded": ", ".join(map(str, demos.excluded))[:5000],
+    }
+
+
+def _dataset_of(demos: Demonstrations) -> dict[str, Any]:
+    facts = {"episodes": demos.episodes, "frames": demos.frames, "fps": demos.fps, "content_hash": demos.content_hash}
+    return {"name": demos.name, "source": demos.source, "revision": demos.revision, "facts": facts}
 
 
 def about_training(run: RunCard, trained: Sequence, seeds: Sequence[int], model: str | None) -> Message:

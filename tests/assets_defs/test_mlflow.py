@@ -1,8 +1,10 @@
 """What a benchmark leaves in MLflow, read back through MLflow itself."""
 
+import csv
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import mlflow
 import numpy as np
@@ -46,7 +48,7 @@ def test_one_experiment_one_run_a_policy_seeds_nested(client, run_of):
     top = {r.info.run_name for r in runs if "mlflow.parentRunId" not in r.data.tags}
     assert top == {
         "hold_still/state", "mean_action/state", "constant_velocity/state", "nearest_neighbour/state", "mlp_k01/state",
-        "mlp_k04/state",
+        "mlp_k04/state", "benchmark",
     }  # fmt: skip
     parent = run_of("mlp_k04")
     children = [r for r in runs if r.data.tags.get("mlflow.parentRunId") == parent.info.run_id]
@@ -54,6 +56,33 @@ def test_one_experiment_one_run_a_policy_seeds_nested(client, run_of):
     assert all(r.data.metrics["first_step_mae"] > 0 for r in children)
     assert parent.data.params["chunk"] == "4"
     assert parent.info.status == "FINISHED"
+
+
+def test_a_table_is_a_run_with_its_rows_and_its_report(finished, client):
+    experiment = client.get_experiment_by_name("tiny")
+    (run,) = client.search_runs([experiment.experiment_id], "attributes.run_name = 'benchmark'")
+    kept = Path(client.download_artifacts(run.info.run_id, ""))
+    assert {path.name for path in kept.iterdir()} == {"policies.csv", "table.json", "report.html", "errors.png"}
+    for name, asset in (("policies.csv", "benchmark_table"), ("report.html", "benchmark_report")):
+        assert (kept / name).read_bytes() == (finished.plan().folder(Unit(asset)) / name).read_bytes()
+    with (kept / "policies.csv").open(newline="") as file:
+        rows = {row["policy"]: row for row in csv.DictReader(file)}
+    assert float(rows["hold_still"]["vs_hold_still"]) == pytest.approx(1)
+    assert len(rows) == 6
+
+
+def test_policies_are_compared_without_tables_and_seeds_the_best_first(client):
+    experiment = client.get_experiment_by_name("tiny")
+    view = json.loads(experiment.tags["mlflow.sharedViewState.demobench"])
+    order = [f"{view['orderByKey']} {'ASC' if view['orderByAsc'] else 'DESC'}"]
+    compared = client.search_runs([experiment.experiment_id], view["searchFilter"], order_by=order)
+    errors = [run.data.metrics["first_step_mae"] for run in compared]
+    assert len(errors) == 6
+    assert errors == sorted(errors)
+    drawn = {chart["metricKey"] for chart in view["compareRunCharts"]}
+    here = {name for run in compared for name in run.data.metrics}
+    assert drawn - here == {"rollout_success", "rollout_score"}, "what is drawn is measured, where there is a simulator"
+    assert "One run a policy" in experiment.tags["mlflow.note.content"]
 
 
 def test_losses_and_errors_have_steps(finished, client, run_of):
