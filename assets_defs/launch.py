@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,6 +33,8 @@ from assets_defs.definitions import LOCATION
 from assets_defs.resources import HOST_TAG, PID_TAG
 
 MODULE = "assets_defs.definitions"
+START_S = 600
+"""Longer than Dagster takes to start a run's process, on a busy machine, too."""
 
 INSTANCE_SETTINGS = """\
 # Written by demobench; delete it to get the defaults back.
@@ -67,18 +70,40 @@ def open_instance(store_root: Path) -> Iterator[dg.DagsterInstance]:
         yield instance
 
 
-def close_dead_runs(instance: dg.DagsterInstance) -> list[str]:
-    """Runs of this machine whose process is gone are marked as failed; returns their ids."""
-    running = instance.get_runs(
-        dg.RunsFilter(
-            statuses=[dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.STARTED, dg.DagsterRunStatus.CANCELING],
-            tags={HOST_TAG: socket.gethostname()},
-        )
-    )
-    dead = [run for run in running if not psutil.pid_exists(int(run.tags.get(PID_TAG, 0)))]
-    for run in dead:
-        instance.report_run_failed(run, message=f"The process {run.tags[PID_TAG]} that made this run is gone.")
-    return [run.run_id for run in dead]
+def close_dead_runs(instance: dg.DagsterInstance, clock: Callable[[], float] = time.time) -> list[str]:
+    """Runs of this machine whose process is gone are marked as failed; returns what to say of each.
+
+    A run that waits for its process longer than any start takes never gets one: whoever started it was stopped.
+    """
+    under_way = [dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.STARTED, dg.DagsterRunStatus.CANCELING]
+    words = []
+    for record in instance.get_run_records(dg.RunsFilter(statuses=under_way)):
+        why = _why_dead(record, clock())
+        if why is not None:
+            run = record.dagster_run
+            instance.report_run_failed(run, message=f"{why[0].upper()}{why[1:]}.")
+            words.append(f"closed run {run.run_id[:8]} of {run.tags.get('dagster/partition', 'no data set')}: {why}")
+    return words
+
+
+def _why_dead(record: dg.RunRecord, now_s: float) -> str | None:
+    """Why a run that is under way will never end; None where its process is there, or nobody here can tell."""
+    tags = record.dagster_run.tags
+    if HOST_TAG not in tags:
+        waited_s = now_s - record.update_timestamp.timestamp()
+        return "it was started and never got a process" if waited_s > START_S else None
+    started_s = record.start_time or record.create_timestamp.timestamp()
+    if tags[HOST_TAG] != socket.gethostname() or _runs(int(tags[PID_TAG]), started_s):
+        return None
+    return f"the process {tags[PID_TAG]} that made it is gone"
+
+
+def _runs(pid: int, started_s: float) -> bool:
+    """Whether the process that made a run is there; a younger one got its number after it."""
+    try:
+        return psutil.Process(pid).create_time() < started_s + 60
+    except psutil.NoSuchProcess:
+        return False
 
 
 class Interrupts:

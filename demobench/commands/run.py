@@ -202,8 +202,8 @@ def _dagster(
             progress=report,
             experiments={target.key: target.experiment},
         )
-        for run_id in close_dead_runs(instance):
-            progress.say(f"closed run {run_id[:8]}, whose process was gone")
+        for words in close_dead_runs(instance):
+            progress.say(words)
         yield instance, defs
 
 

@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from rich.console import Console
@@ -17,6 +17,9 @@ from demobench.commands.files import FileServer
 from demobench.commands.session import Session, open_session, tell_mlflow
 from pipeline.errors import DemobenchError
 from pipeline.sinks.to_mlflow import tracking_uri, without_secret
+
+LOOK_S = 30
+"""How often runs are looked for whose process is gone."""
 
 
 def serve(port: int, mlflow_port: int, files_port: int, config_path: Path | None, store_path: str | None) -> None:
@@ -49,7 +52,7 @@ def serve(port: int, mlflow_port: int, files_port: int, config_path: Path | None
         try:
             mlflow = f"http://{HOST}:{mlflow_port}" if sqlite else session.config.tracking.mlflow
             _announce(session.console, f"http://{HOST}:{port}", mlflow, f"http://{HOST}:{files_port}")
-            _wait(processes)
+            _wait(processes, lambda: _close_dead_runs(session))
         except KeyboardInterrupt:
             session.console.print("stopped")
         finally:
@@ -71,8 +74,8 @@ def _close_dead_runs(session: Session) -> None:
     from assets_defs.launch import close_dead_runs, open_instance
 
     with open_instance(session.store.root) as instance:
-        for run_id in close_dead_runs(instance):
-            session.console.print(f"closed run {run_id[:8]}, whose process was gone")
+        for words in close_dead_runs(instance):
+            session.console.print(words, soft_wrap=True)
 
 
 def _dagster(session: Session, port: int, scratch: Path, config_path: Path | None) -> subprocess.Popen:
@@ -119,7 +122,9 @@ def _announce(console: Console, dagster: str, mlflow: str, files: str) -> None:
     console.print("Ctrl-C stops all.")
 
 
-def _wait(processes: Mapping[str, subprocess.Popen]) -> None:
+def _wait(processes: Mapping[str, subprocess.Popen], look: Callable[[], None]) -> None:
+    """Until a server ends. Every `LOOK_S` a `look` at what else may have ended: a killed run keeps its data set from the next."""
+    looked = time.monotonic()
     while True:
         for name, process in processes.items():
             if process.poll() is not None:
@@ -127,6 +132,9 @@ def _wait(processes: Mapping[str, subprocess.Popen]) -> None:
                     f"{name} ended by itself with status {process.returncode}. Try its command alone to see why: "
                     f"{' '.join(process.args)}"
                 )
+        if time.monotonic() - looked > LOOK_S:
+            look()
+            looked = time.monotonic()
         time.sleep(0.5)
 
 

@@ -3,11 +3,14 @@
 import os
 import signal
 import socket
+import time
+from datetime import UTC, datetime
 
 import dagster as dg
 import pytest
+from dagster._core.test_utils import freeze_time
 
-from assets_defs.launch import HOST_TAG, PID_TAG, close_dead_runs, open_instance, run_benchmark
+from assets_defs.launch import HOST_TAG, PID_TAG, START_S, close_dead_runs, open_instance, run_benchmark
 from assets_defs.resources import Budget
 from pipeline.errors import ConfigError
 
@@ -37,14 +40,38 @@ def test_an_interrupted_run_ends_as_canceled(finished):
 def test_runs_whose_process_is_gone_are_closed_and_others_left(finished):
     with open_instance(finished.store.root) as instance:
         job = finished.defs().resolve_job_def("benchmark")
+        here, before = {HOST_TAG: socket.gethostname()}, dg.DagsterRunStatus.STARTED
+        asked = {
+            "dead": {PID_TAG: str(2**22 + 1), **here},
+            "alive": {PID_TAG: str(os.getpid()), **here},
+            "elsewhere": {PID_TAG: str(2**22 + 1), HOST_TAG: "another-machine"},
+            "nobody's": {},
+        }
         runs = {}
-        for name, pid in (("dead", 2**22 + 1), ("alive", os.getpid())):
-            tags = {PID_TAG: str(pid), HOST_TAG: socket.gethostname(), "dagster/partition": "tiny"}
-            runs[name] = instance.create_run_for_job(job_def=job, tags=tags, status=dg.DagsterRunStatus.STARTED)
-        assert close_dead_runs(instance) == [runs["dead"].run_id]
+        for name, tags in asked.items():
+            tags = {**tags, "dagster/partition": "tiny"}
+            runs[name] = instance.create_run_for_job(job_def=job, tags=tags, status=before)
+        words = f"closed run {runs['dead'].run_id[:8]} of tiny: the process {2**22 + 1} that made it is gone"
+        assert close_dead_runs(instance) == [words]
         assert instance.get_run_by_id(runs["dead"].run_id).status == dg.DagsterRunStatus.FAILURE
-        assert instance.get_run_by_id(runs["alive"].run_id).status == dg.DagsterRunStatus.STARTED
-        instance.report_run_failed(runs["alive"])
+        assert {instance.get_run_by_id(runs[name].run_id).status for name in list(asked)[1:]} == {before}
+        for name in list(asked)[1:]:
+            instance.report_run_failed(runs[name])
+
+
+def test_a_run_that_never_got_a_process_or_whose_process_left_its_number_to_another_is_closed(finished):
+    with open_instance(finished.store.root) as instance:
+        job = finished.defs().resolve_job_def("benchmark")
+        tags = {"dagster/partition": "tiny"}
+        waiting = instance.create_run_for_job(job_def=job, tags=tags, status=dg.DagsterRunStatus.STARTING)
+        assert close_dead_runs(instance) == []
+        (words,) = close_dead_runs(instance, lambda: time.time() + START_S + 60)
+        assert words == f"closed run {waiting.run_id[:8]} of tiny: it was started and never got a process"
+        tags |= {PID_TAG: str(os.getpid()), HOST_TAG: socket.gethostname()}
+        with freeze_time(datetime(2026, 1, 1, tzinfo=UTC)):
+            old = instance.create_run_for_job(job_def=job, tags=tags, status=dg.DagsterRunStatus.STARTED)
+        (words,) = close_dead_runs(instance)
+        assert words.startswith(f"closed run {old.run_id[:8]} of tiny: the process {os.getpid()}")
 
 
 def test_another_budget_in_the_launchpad_is_the_command_lines_variant(finished):
@@ -68,7 +95,7 @@ def test_a_run_says_who_makes_it_and_where_its_results_are_seen(finished):
     assert run.tags["demobench/report"] == "http://127.0.0.1:3001/tiny/benchmark_report/report.html"
     assert run.tags["demobench/history"] == "http://127.0.0.1:3001/tiny/benchmark_history/history.html"
     assert run.tags["demobench/mlflow"].startswith("http://127.0.0.1:5000/#/experiments/")
-    assert run.tags["demobench/mlflow"].endswith("/runs")
+    assert run.tags["demobench/mlflow"].endswith("/runs?viewStateShareKey=demobench&compareRunsMode=CHART")
     assert {name: table.metadata[name].value for name in ("report", "mlflow")} == {
         name: run.tags[f"demobench/{name}"] for name in ("report", "mlflow")
     }
