@@ -76,8 +76,9 @@ def check_cron(config: Config) -> None:
 def stale_assets(workbench: Workbench, key: str) -> list[dg.AssetKey]:
     """The assets of a partition that have work to do, as keys; policies that must be named are left out."""
     experiment = workbench.experiment(key)
-    variants = workbench.variants_of(experiment)
-    plan = Plan(workbench.store, key, experiment, variants, tuple(v.name for v in variants if not v.only_when_named))
+    policies = workbench.policies_of(experiment)
+    by_itself = tuple(v.name for v in policies if not v.only_when_named)
+    plan = Plan(workbench.store, key, experiment, policies, by_itself)
     return asset_keys(plan.stale())
 
 

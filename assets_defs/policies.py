@@ -39,8 +39,29 @@ def _make_entries(
     bench: Bench, variant: Variant, kind: str, work: Callable[[Bench, Variant, Unit, Path], Outcome]
 ) -> dict[str, Made]:
     """Every entry of one asset of a policy that is asked for: observation set → what made it."""
-    units = bench.plan.selected_units(variant, kind)
-    return {unit.entry: bench.make(unit, partial(work, bench, variant, unit)) for unit in units}
+    units = _units(bench, variant, kind)
+    return {unit.entry: bench.make(unit, partial(work, bench, _its(bench, variant), unit)) for unit in units}
+
+
+def _units(bench: Bench, variant: Variant, kind: str) -> list[Unit]:
+    """The entries that are asked for; none where the data set does not have the policy."""
+    its = _its(bench, variant)
+    return bench.plan.selected_units(its, kind) if its else []
+
+
+def _its(bench: Bench, variant: Variant) -> Variant | None:
+    """The policy as the data set has it; None where it does not."""
+    return next((v for v in bench.plan.variants if v.name == variant.name), None)
+
+
+def _not_part(bench: Bench, variant: Variant) -> str | None:
+    """Why there are no entries, where the data set does not have the policy: a run of everything must not stop at that."""
+    if _its(bench, variant) is not None:
+        return None
+    return (
+        f"'{bench.plan.key}' was benchmarked from the command line with the policies of that time, and {variant.name} is none of "
+        f"them. demobench run {bench.experiment.dataset.source} takes those of the file as it is now."
+    )
 
 
 def _everyone(bench: Bench) -> list[str]:
@@ -76,10 +97,11 @@ def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
         ]
         plots = {
             f"losses_{unit.entry}": picture(bench.plan.folder(unit) / "losses.png")
-            for unit in bench.plan.selected_units(variant, "trained_policy")
+            for unit in _units(bench, variant, "trained_policy")
         }
         header = ["observations", "parameters", "steps", "training s", "CPU s", "GPU memory, MB", "last loss"]
-        metadata = {"training": table(header, rows), **plots, **mlflow_links(bench, made)}
+        why_none = {"why_none": _not_part(bench, variant)}
+        metadata = {"training": table(header, rows), **plots, **mlflow_links(bench, made), **why_none}
         return result(bench, asset_key, made, present(metadata), ["finite_losses"])
 
     return trained_policy
@@ -166,11 +188,11 @@ def _predictions(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDef
         ]
         plots = {
             f"error_by_horizon_{unit.entry}": picture(bench.plan.folder(unit) / "error_by_horizon.png")
-            for unit in bench.plan.selected_units(variant, "predictions")
+            for unit in _units(bench, variant, "predictions")
         }
         numbers = {f"first_step_mae_{row[0]}": dg.MetadataValue.float(row[1]) for row in rows if row[1] is not None}
         header = ["observations", "first-step MAE", "× hold-still", "latency, ms", "99th percentile, ms"]
-        metadata = {"scores": table(header, rows), **numbers, **plots}
+        metadata = {"scores": table(header, rows), **numbers, **plots, "why_none": _not_part(bench, variant)}
         return result(bench, asset_key, made, present(metadata), ["finite", "every_held_out_episode"])
 
     return predictions
@@ -244,7 +266,8 @@ def _rollouts(variant: Variant, trained: dg.AssetsDefinition) -> dg.AssetsDefini
             r = m.summary["rollouts"]
             rows.append((entry, m.summary["why_not"], r and r["n"], r and r["success"], r and r["score"]))
         header = ["observations", "not applicable", "start states", "success rate", "score (mean best reward)"]
-        return result(bench, asset_key, made, {"rollouts": table(header, rows)}, ["sane"])
+        metadata = {"rollouts": table(header, rows), "why_none": _not_part(bench, variant)}
+        return result(bench, asset_key, made, present(metadata), ["sane"])
 
     return rollouts
 

@@ -110,9 +110,13 @@ class Workbench:
             raise ConfigError(f"No data set '{key}' in the configuration or in {self.store.root}. {known}")
         return Experiment.model_validate(registered[key])
 
-    def variants_of(self, experiment: Experiment) -> tuple[Variant, ...]:
-        """The policies of one data set: the graph also has those that are for others only."""
-        return tuple(v for v in self.variants if v.family in experiment.policies)
+    def policies_of(self, experiment: Experiment) -> tuple[Variant, ...]:
+        """The policies of an experiment that there are assets for.
+
+        What was benchmarked from the command line keeps the settings of that time: policies that the file got since are not its.
+        """
+        defined = {v.name for v in self.variants}
+        return tuple(v for v in experiment.variants if v.name in defined)
 
     def open(self, context: dg.AssetExecutionContext, budget: Budget, look_at_source: bool = False) -> "Bench":
         """The partition of a run, with the budget of its launch. Only the first asset looks at the source."""
@@ -123,8 +127,8 @@ class Workbench:
             key = variant_key(key.split("+")[0], from_base(self, key, base), experiment)
             self.store.register(key, experiment.model_dump(mode="json"))
         experiment.require_sets(budget.observations)
-        variants = self.variants_of(experiment)
-        plan = Plan(self.store, key, experiment, variants, (), tuple(budget.observations), look_at_source)
+        policies = self.policies_of(experiment)
+        plan = Plan(self.store, key, experiment, policies, (), tuple(budget.observations), look_at_source)
         return Bench(self, plan, self.progress or Progress(context.log.info), context.log.warning)
 
 

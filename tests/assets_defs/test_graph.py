@@ -8,10 +8,13 @@ import dagster as dg
 import numpy as np
 import pytest
 
+from assets_defs.automation import stale_assets
+from assets_defs.definitions import build_defs
+from assets_defs.launch import open_instance, run_benchmark
 from assets_defs.plan import Unit
 from pipeline.predict import load_predictions
 from pipeline.store import Store
-from tests.assets_defs.conftest import TINY, TinyBenchmark
+from tests.assets_defs.conftest import TINY, TinyBenchmark, why_failed
 from tests.makers import tiny_recording, write_v3
 
 
@@ -154,8 +157,6 @@ def test_graph_groups_and_dependencies(finished):
 
 
 def test_every_asset_says_what_it_cost_and_shows_something(finished):
-    from assets_defs.launch import open_instance
-
     with open_instance(finished.store.root) as instance:
         for node in finished.defs().resolve_asset_graph().asset_nodes:
             if node.key.to_user_string() in ("learning_curve", "scored_predictions"):
@@ -166,3 +167,22 @@ def test_every_asset_says_what_it_cost_and_shows_something(finished):
             assert {"seconds", "peak_memory_mb"} <= set(metadata), node.key
             assert len(metadata) > 3, node.key
             assert event.asset_materialization.tags["dagster/data_version"]
+
+
+def test_a_policy_that_the_file_got_since_is_left_out_of_what_was_registered_before(copy):
+    before = copy.target().experiment
+    shutil.copytree(copy.store.dataset("tiny"), copy.store.dataset("older"))
+    copy.store.register("older", before.model_dump(mode="json"))
+    copy.raw["policies"]["near"] = {"method": "lwr", "chunks": [1]}
+    defs = build_defs(copy.config, config_dir=copy.folder, store=copy.store)
+    near = [dg.AssetKey(["near_k01", kind]) for kind in ("trained_policy", "predictions", "rollouts")]
+    with open_instance(copy.store.root) as instance:
+        run = run_benchmark(instance, defs, "older", [*near, dg.AssetKey(["benchmark_table"])])
+        assert run.is_success, why_failed(instance, run)
+        said = instance.get_latest_materialization_event(near[1]).asset_materialization.metadata["why_none"].value
+        table = instance.get_latest_materialization_event(dg.AssetKey(["benchmark_table"])).asset_materialization
+    assert said.startswith("'older' was benchmarked from the command line with the policies of that time, and near_k01")
+    assert said.endswith(f"demobench run {copy.folder} takes those of the file as it is now.")
+    assert not copy.store.folder("older", "near_k01").exists()
+    assert "mae_mlp_k04_state" in table.metadata
+    assert stale_assets(defs.resources["workbench"], "older") == []
