@@ -24,6 +24,7 @@ from pipeline.methods import EXTERNAL
 
 if TYPE_CHECKING:
     from pipeline.history import Line
+    from pipeline.sinks.to_mlflow import Message
 
 TABLE = dg.AssetKey(["benchmark_table"])
 REPORT = dg.AssetKey(["benchmark_report"])

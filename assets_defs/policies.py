@@ -58,6 +58,9 @@ def _not_part(bench: Bench, variant: Variant) -> str | None:
     """Why there are no entries, where the data set does not have the policy: a run of everything must not stop at that."""
     if _its(bench, variant) is not None:
         return None
+    of_file = bench.workbench.config.policies.get(variant.family)
+    if of_file is not None and not of_file.is_for(bench.experiment.name):
+        return f"{variant.name} is for other data sets only: {', '.join(of_file.datasets)}."
     return (
         f"'{bench.plan.key}' was benchmarked from the command line with the policies of that time, and {variant.name} is none of "
         f"them. demobench run {bench.experiment.dataset.source} takes those of the file as it is now."

@@ -113,7 +113,8 @@ class Workbench:
     def policies_of(self, experiment: Experiment) -> tuple[Variant, ...]:
         """The policies of an experiment that there are assets for.
 
-        What was benchmarked from the command line keeps the settings of that time: policies that the file got since are not its.
+        Of the file's policies some are for other data sets only; and what was benchmarked from the command line keeps the
+        settings of that time: policies that the file got since are not its.
         """
         defined = {v.name for v in self.variants}
         return tuple(v for v in experiment.variants if v.name in defined)

@@ -136,15 +136,13 @@ class Experiment(Settings):
                 raise ConfigError(f"The data set '{self.name}' has no observation set '{name}'. {known}")
 
     def sets_of(self, variant: Variant) -> list[ObservationSet]:
-        """The observation sets a policy is asked with on this data set; none if it is not for this data set.
+        """The observation sets a policy is asked with on this data set.
 
         A method whose answer does not depend on the set runs once, under the first set that holds the arm's own state.
         """
         if not METHODS[variant.method].uses_observations:
             with_state = [s for s in self.observation_sets if "observation.state" in s.features]
             return (with_state or self.observation_sets)[:1]
-        if variant.family not in self.policies:
-            return []
         wanted = self.policies[variant.family].observations
         return [s for s in self.observation_sets if wanted == "all" or s.name in wanted]
 

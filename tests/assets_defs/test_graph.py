@@ -186,3 +186,18 @@ def test_a_policy_that_the_file_got_since_is_left_out_of_what_was_registered_bef
     assert not copy.store.folder("older", "near_k01").exists()
     assert "mae_mlp_k04_state" in table.metadata
     assert stale_assets(defs.resources["workbench"], "older") == []
+
+
+def test_a_policy_for_other_data_sets_makes_nothing_and_says_so(copy):
+    copy.raw["datasets"] = {"other": {"source": "elsewhere"}}
+    copy.raw["policies"]["theirs"] = {"method": "lwr", "chunks": [1], "datasets": ["other"]}
+    defs = build_defs(copy.config, config_dir=copy.folder, store=copy.store)
+    assert stale_assets(defs.resources["workbench"], "tiny") == []
+    theirs = [dg.AssetKey(["theirs_k01", kind]) for kind in ("trained_policy", "predictions", "rollouts")]
+    with open_instance(copy.store.root) as instance:
+        run = run_benchmark(instance, defs, "tiny", theirs)
+        assert run.is_success, why_failed(instance, run)
+        for key in theirs:
+            said = instance.get_latest_materialization_event(key).asset_materialization.metadata["why_none"].value
+            assert said == "theirs_k01 is for other data sets only: other."
+    assert not copy.store.folder("tiny", "theirs_k01").exists()
