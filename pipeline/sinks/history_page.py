@@ -25,21 +25,27 @@ REPORT = "../benchmark_report/report.html"
 SHAPES = {"circle": "●", "square": "■", "diamond": "◆", "triangle-up": "▲", "cross": "✚"}
 """Of points, by observation set, and how they are written."""
 LATEST = 30
-"""So many tables are in the chart; all are on the page."""
+"""So many tables are in the page's chart; all are in its table."""
+IN_PICTURE = 10
+"""So many are in the picture, which nobody can scroll."""
 LARGEST_TIMES = 4.0
 """Rows whose error never is within so many times the smallest are left out of the chart: they would flatten the rest."""
 
 
-def history_chart(lines: Sequence[Line], *, unit: str | None, legend: bool = True) -> alt.LayerChart:
+def history_chart(
+    lines: Sequence[Line], *, unit: str | None, latest: int = LATEST, legend: bool = True
+) -> alt.LayerChart:
     """First-step errors with their intervals, a point a table, in the order in which the latest tables were made.
 
     A ring marks the champion. Tooltips name the data and the code. The scale is beside the latest table.
     """
-    points = _points(lines)
+    points = _points(lines, latest)
     policies = sorted({point["policy"] for point in points})
     addresses, sets = (sorted({point[of] for point in points}) for of in ("address", "observations"))
-    order = [_label(place, line) for place, line in _latest(lines)]
-    by_words = alt.Axis(grid=False, labelAngle=0, labelExpr="split(datum.label, ' ')", labelLineHeight=14)
+    order = [_label(place, line) for place, line in _latest(lines, latest)]
+    by_words = alt.Axis(
+        grid=False, titleAnchor="end", labelAngle=0, labelExpr="split(datum.label, ' ')", labelLineHeight=14
+    )
     x = alt.X("run:O", sort=order, title="table, when it was made, commit of the code", axis=by_words)
     top = max((p["high"] or p["error"] for p in points), default=1.0)
     y = alt.Y(
@@ -68,9 +74,9 @@ def history_chart(lines: Sequence[Line], *, unit: str | None, legend: bool = Tru
     return alt.layer(*layers).properties(width=max(WIDTH, (40 + 5 * len(addresses)) * len(order)), height=HEIGHT)
 
 
-def _points(lines: Sequence[Line]) -> list[dict[str, Any]]:
+def _points(lines: Sequence[Line], latest: int = LATEST) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = []
-    for place, line in _latest(lines):
+    for place, line in _latest(lines, latest):
         for row in line.rows:
             if row["first_step_mae"] is None:
                 continue
@@ -89,8 +95,8 @@ def _points(lines: Sequence[Line]) -> list[dict[str, Any]]:
     return [point for point in found if point["address"] in near]
 
 
-def _latest(lines: Sequence[Line]) -> list[tuple[int, Line]]:
-    return list(enumerate(lines))[-LATEST:]
+def _latest(lines: Sequence[Line], latest: int) -> list[tuple[int, Line]]:
+    return list(enumerate(lines))[-latest:]
 
 
 def _label(place: int, line: Line) -> str:
@@ -112,7 +118,7 @@ def _data(line: Line) -> str:
 
 def picture_history(lines: Sequence[Line], *, unit: str | None) -> bytes | None:
     """The chart as a PNG; None where there is no number to draw."""
-    return chart_png(history_chart(lines, unit=unit)) if _points(lines) else None
+    return chart_png(history_chart(lines, unit=unit, latest=IN_PICTURE)) if _points(lines, IN_PICTURE) else None
 
 
 def write_history_page(lines: Sequence[Line], path: Path, *, name: str, unit: str | None) -> None:

@@ -157,6 +157,8 @@ def test_only_the_latest_tables_are_drawn():
     many = [replace(FIRST, when=f"{year}-03-02T03:00:05Z") for year in range(2026, 2066)]
     points = next(iter(history_chart(many, unit="px").to_dict()["datasets"].values()))
     assert {p["run"][:2] for p in points} == {str(n) for n in range(11, 41)}
+    width = int.from_bytes(picture_history(many, unit="px")[16:20])  # of the PNG
+    assert width < 2 * 1300, "a picture cannot be scrolled"
 
 
 def test_a_table_without_a_number_is_told_and_not_drawn(tmp_path):
