@@ -69,9 +69,10 @@ def rollouts() -> Rollouts:
     )  # fmt: skip
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser():
-    """A real Chromium without a window."""
+    """A real Chromium without a window. While it is open an event loop runs, in which others cannot begin one of their own: so it
+    is closed after each file."""
     program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if program is None:
         pytest.skip("no Chromium on this machine")
