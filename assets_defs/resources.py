@@ -130,7 +130,8 @@ class Workbench:
         experiment.require_sets(budget.observations)
         policies = self.policies_of(experiment)
         plan = Plan(self.store, key, experiment, policies, (), tuple(budget.observations), look_at_source)
-        return Bench(self, plan, self.progress or Progress(context.log.info), context.log.warning)
+        progress = self.progress or Progress(context.log.info)
+        return Bench(self, plan, progress, context.log.warning, context.partition_key, context.log_event)
 
 
 def from_base(workbench: Workbench, key: str, fallback: Experiment) -> Experiment:
@@ -144,12 +145,18 @@ def from_base(workbench: Workbench, key: str, fallback: Experiment) -> Experimen
 
 @dataclass(frozen=True)
 class Bench:
-    """One partition, opened for one asset."""
+    """One partition, opened for one asset.
+
+    partition   the run's partition; the plan's is another where the launch asked for another budget
+    log_event   how Dagster is told of results of another partition than the run's
+    """
 
     workbench: Workbench
     plan: Plan
     progress: Callable[[str, int, int, str], None]
     warn: Say
+    partition: str | None = None
+    log_event: Callable[[dg.AssetMaterialization], None] | None = None
 
     @property
     def store(self) -> Store:
@@ -267,21 +274,44 @@ def result(
 
     `made` has one entry an observation set ("" for assets without). A check passes when it passes in every entry.
     """
-    version = hash_of({entry: m.fingerprint for entry, m in made.items()})
+    version = _version(made)
     costs = {
         "seconds": dg.MetadataValue.float(sum((m.seconds for m in made.values()), 0.0)),
         "peak_memory_mb": dg.MetadataValue.float(max((m.peak_memory_mb for m in made.values()), default=0.0)),
         "stored_in": dg.MetadataValue.path(str(bench.store.dataset(bench.plan.key))),
     }
+    metadata = {**metadata, **costs}
+    if bench.partition not in (None, bench.plan.key):
+        metadata, version = _made_elsewhere(bench, asset_key, made, metadata)
     return dg.MaterializeResult(
         asset_key=asset_key,
-        metadata={**metadata, **costs},
+        metadata=metadata,
         check_results=[
             *(_check(asset_key, name, made, dg.AssetCheckSeverity.ERROR) for name in checks),
             *(_check(asset_key, name, made, dg.AssetCheckSeverity.WARN) for name in warnings),
         ],
         data_version=dg.DataVersion(version),
     )
+
+
+def _version(made: Mapping[str, Made]) -> str:
+    return hash_of({entry: m.fingerprint for entry, m in made.items()})
+
+
+def _made_elsewhere(
+    bench: Bench, asset_key: dg.AssetKey, made: Mapping[str, Made], metadata: Mapping[str, Any]
+) -> tuple[dict[str, Any], str]:
+    """Another budget in the launchpad makes results of another partition: Dagster hears of them under that one.
+
+    What the run's own partition holds did not change, and neither does its version nor its numbers over time; returned are both.
+    """
+    key, asset = bench.plan.key, "/".join(asset_key.path)
+    tags = {"dagster/data_version": _version(made)}
+    bench.log_event(dg.AssetMaterialization(asset_key, metadata=dict(metadata), partition=key, tags=tags))
+    store = bench.store
+    own = {entry: there for entry in made if (there := store.made(store.folder(bench.partition, asset, entry)))}
+    words = f"This launch asked for other numbers of seeds or steps than '{bench.partition}' has: its results are those of '{key}'."
+    return {"made_instead": key, "why": words}, _version(own)
 
 
 def _check(
