@@ -10,6 +10,7 @@ import dagster as dg
 from assets_defs.data import PARTITIONS
 from assets_defs.plan import Plan, Unit
 from assets_defs.resources import Workbench, asset_keys
+from assets_defs.up_to_date import say_what_is_out_of_date
 from pipeline import errors
 from pipeline.config import Config
 from pipeline.errors import ConfigError, DemobenchError
@@ -53,7 +54,7 @@ def automation(config: Config, policies: Sequence[Variant]) -> dict[str, list[An
     return {
         "jobs": [benchmark, rebenchmark, curve, score],
         "schedules": [_weekly(config, rebenchmark)],
-        "sensors": [register_datasets, _new_revision(rebenchmark), run_failed],
+        "sensors": [register_datasets, _new_revision(rebenchmark), run_failed, say_what_is_out_of_date],
     }
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import dagster as dg
 
+from assets_defs import up_to_date
 from assets_defs.curve import KEY as CURVE
 from assets_defs.curve import read_kept
 from assets_defs.data import PARTITIONS, demonstrations, episode_split
@@ -78,6 +79,7 @@ def _benchmark_table(
             check_spec(TABLE, "baselines_present", "Hold-still is in the table: every error is read against it."),
             check_spec(TABLE, "same_data", "Every row was computed from the same demonstrations and split."),
             warning_spec(TABLE, REGRESSION, gate_words(cron)),
+            warning_spec(TABLE, up_to_date.CHECK, up_to_date.WORDS),
         ],
     )
     def benchmark_table(
@@ -94,7 +96,8 @@ def _benchmark_table(
         made = bench.make(Unit("benchmark_table"), lambda draft: _write_table(bench, draft))
         line = record(bench, made, project_version(), context.run.run_id)
         verdict = (not line.got_worse, regression_words(line))
-        made = replace(made, summary={**made.summary, "checks": {**made.summary["checks"], REGRESSION: verdict}})
+        checks = {**made.summary["checks"], REGRESSION: verdict, up_to_date.CHECK: (True, up_to_date.JUST_MADE)}
+        made = replace(made, summary={**made.summary, "checks": checks})
         header = ["policy", "sees", "first-step MAE", "95 %", "× still", "success"]
         metadata = {
             "table": table(header, made.summary["rows"]),
@@ -106,7 +109,12 @@ def _benchmark_table(
             **{f"mae_{row[0]}_{row[1]}": float(row[2]) for row in made.summary["rows"] if row[2] is not None},
         }
         return result(
-            bench, TABLE, {"": made}, present(metadata), ["baselines_present", "same_data"], warnings=[REGRESSION]
+            bench,
+            TABLE,
+            {"": made},
+            present(metadata),
+            ["baselines_present", "same_data"],
+            warnings=[REGRESSION, up_to_date.CHECK],
         )
 
     return benchmark_table

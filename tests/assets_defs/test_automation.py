@@ -320,4 +320,4 @@ def test_a_webhook_that_never_answers_does_not_hold_up_the_sensor(failed, monkey
 
 def test_the_sensors_that_only_look_and_write_run_by_default(fresh):
     running = {s.name for s in fresh.defs().sensors if s.default_status == dg.DefaultSensorStatus.RUNNING}
-    assert running == {"register_datasets", "run_failed"}
+    assert running == {"register_datasets", "run_failed", "say_what_is_out_of_date"}
