@@ -1,4 +1,4 @@
-"""What is looked at: held-out episodes beside what every policy predicted, for MCAP readers and for Rerun; roll-outs as a video."""
+"""What is looked at: held-out episodes with what every policy predicted, and roll-outs, for MCAP readers and for Rerun; a video."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -25,13 +25,15 @@ RERUN = dg.AssetKey(["rerun_recording"])
 VIDEO = dg.AssetKey(["rollout_video"])
 EPISODES = 10
 """How many held-out episodes a recording shows."""
-CAMERA_BYTES = 16_000_000
-"""What cameras may take of a Rerun recording, so that it stays below 20 MB."""
+START_STATES = 4
+"""How many start states a recording shows of every policy that was rolled out."""
+MOST_BYTES = 20_000_000
+"""How large a Rerun recording may be with cameras in it."""
 
 
 def looking_assets(deps: Sequence[dg.AssetKey], rollouts: Sequence[dg.AssetKey]) -> list[dg.AssetsDefinition]:
     """Both recordings and the videos; `deps` are the predictions of every policy, `rollouts` its roll-outs."""
-    return [_rollout_video(rollouts), _mcap_log([*deps, VIDEO]), _rerun_recording([*deps, VIDEO, FLOOR_KEY])]
+    return [_rollout_video(rollouts), _mcap_log([*deps, *rollouts]), _rerun_recording([*deps, *rollouts, FLOOR_KEY])]
 
 
 def _held_out(bench: Bench) -> list[int]:
@@ -61,8 +63,8 @@ def _mcap_log(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
 
         `/joint_states` is what the robot did, `/joint_commands` what the person commanded, `/policy/<policy>/<observations>`
         the first action each policy would have taken, `/camera/<name>` the picture of each frame, `/rollout/…` what policies did
-        in closed loop. Times are the demonstration's own clock. Attached are the settings, the split and the data's hash. Of a
-        file that was cut off, `demobench view FILE.mcap` recovers what is there, and says how far.
+        in closed loop from the first start states. Times are the demonstration's own clock. Attached are the settings, the split
+        and the data's hash. Of a file that was cut off, `demobench view FILE.mcap` recovers what is there, and says how far.
         """
         bench = workbench.open(context, budget)
         unit = Unit("mcap_log")
@@ -74,7 +76,7 @@ def _mcap_log(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
             "open_with": f"demobench view {bench.plan.key} {made.summary['episodes'][0]}",
             "messages": made.summary["messages"],
             "size_mb": made.summary["size_mb"],
-            "cameras left out": table(["why"], [(why,) for why in made.summary["left_out"]]),
+            "left out": table(["why"], [(why,) for why in made.summary["left_out"]]),
         }
         return result(bench, MCAP, {"": made}, metadata, ["readable"])
 
@@ -86,6 +88,7 @@ def _write_mcap(bench: Bench, draft) -> Outcome:
 
     path = draft / "held_out.mcap"
     episodes = _held_out(bench)
+    driven, not_driven = _driven(bench)
     written = write_mcap(
         path,
         bench.demonstrations,
@@ -103,7 +106,7 @@ def _write_mcap(bench: Bench, draft) -> Outcome:
             "split.json": asdict(bench.split),
             "data.json": _data(bench),
         },
-        driven=_driven(bench),
+        driven=driven,
     )
     found = count_messages(path)
     return Outcome(
@@ -111,7 +114,7 @@ def _write_mcap(bench: Bench, draft) -> Outcome:
             "messages": found,
             "episodes": _recorded_ids(bench, episodes),
             "size_mb": round(path.stat().st_size / 1e6, 2),
-            "left_out": written.left_out,
+            "left_out": [*written.left_out, *not_driven],
         },
         {"readable": (found == written.messages, f"{found:,} of {written.messages:,} messages")},
     )
@@ -239,8 +242,9 @@ def _rerun_recording(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
         """Held-out episodes in Rerun: joints recorded against predicted, and the error over time above its floor, if known.
 
         Beside them what there is to see: the cameras, the SO-101 by its own meshes, PushT's table, the chunk predicted just now;
-        roll-outs in tabs of their own. Diamonds mark where a policy disagrees most with the recording. Cameras take the data
-        set's own bytes, of as many episodes as keep the file small; `demobench view` shows the others.
+        a tab for each of the first start states, with what every policy did from it. Diamonds mark where a policy disagrees most
+        with the recording. Cameras take the data set's own bytes, of as many episodes as keep the file small; `demobench view`
+        shows the others.
         """
         bench = workbench.open(context, budget)
         unit = Unit("rerun_recording")
@@ -252,7 +256,7 @@ def _rerun_recording(deps: Sequence[dg.AssetKey]) -> dg.AssetsDefinition:
             "open_with": f"rerun --bind 127.0.0.1 {path}",
             "episodes": dg.MetadataValue.json(made.summary["episodes"]),
             "size_mb": made.summary["size_mb"],
-            "cameras left out": table(["why"], [(why,) for why in made.summary["left_out"]]),
+            "left out": table(["why"], [(why,) for why in made.summary["left_out"]]),
         }
         return result(bench, RERUN, {"": made}, metadata, ["holds_every_episode"])
 
@@ -264,6 +268,7 @@ def _write_rerun(bench: Bench, draft) -> Outcome:
 
     path = draft / "held_out.rrd"
     episodes = _held_out(bench)
+    driven, not_driven = _driven(bench)
     left_out = write_rerun(
         path,
         bench.demonstrations,
@@ -271,14 +276,14 @@ def _write_rerun(bench: Bench, draft) -> Outcome:
         _predictions(bench),
         episodes,
         name=bench.plan.key,
-        driven=_driven(bench),
+        driven=driven,
         floors=mean_error_floors(bench.plan),
-        camera_bytes=CAMERA_BYTES,
+        most_bytes=MOST_BYTES,
     )
     ids = _recorded_ids(bench, episodes)
     found = episodes_in(path)
     return Outcome(
-        {"episodes": ids, "size_mb": round(path.stat().st_size / 1e6, 2), "left_out": left_out},
+        {"episodes": ids, "size_mb": round(path.stat().st_size / 1e6, 2), "left_out": [*left_out, *not_driven]},
         {"holds_every_episode": (found == set(ids), f"{len(found)} of {len(ids)} episodes")},
     )
 
@@ -292,15 +297,25 @@ def mean_error_floors(plan: Plan) -> dict[str, float]:
     return {e.observations: e.value for e in found if e.loss == "mae" and e.horizon == 0 and e.value is not None}
 
 
-def _driven(bench: Bench) -> list["Driven"]:
-    """The roll-outs that there are videos of."""
+def _driven(bench: Bench) -> tuple[list["Driven"], list[str]]:
+    """The first start states of every policy that was rolled out, by its first training seed; and why some are left out."""
+    from pipeline.errors import NotApplicableError, StoreError
+    from pipeline.simulate.scene import drawing_of
     from pipeline.simulate.scene_files import load_scenes
     from pipeline.simulate.trial import load_rollouts
     from pipeline.sinks.rerun_rollouts import Driven
 
-    found = []
-    for video, path in driven_videos(bench):
-        folder = bench.plan.folder(Unit(f"{video.policy}/rollouts", video.observations))
-        rollouts = next(one for one in load_rollouts(folder) if one.seed == video.seed)
-        found.append(Driven(rollouts, load_scenes(folder / f"seed_{video.seed}"), video, path))
-    return found
+    found, left_out = [], []
+    for unit in bench.plan.fresh_policy_units("rollouts"):
+        if not bench.summary(unit)["rollouts"]:
+            continue
+        folder = bench.plan.folder(unit)
+        first = load_rollouts(folder)[0]
+        try:
+            scenes = load_scenes(folder / f"seed_{first.seed}")
+            if scenes and drawing_of(first.simulator):
+                found.append(Driven(first, scenes.first(START_STATES)))
+        except (NotApplicableError, StoreError) as why:
+            # The held-out episodes are worth writing without them.
+            left_out.append(f"roll-outs of {unit.policy} ({unit.entry}): {why}")
+    return found, left_out

@@ -34,8 +34,8 @@ CODE_VERSIONS = {
     "benchmark_table": "8",
     "benchmark_report": "10",
     "rollout_video": "1",
-    "mcap_log": "2",
-    "rerun_recording": "3",
+    "mcap_log": "3",
+    "rerun_recording": "4",
 }
 """Raised by hand when what an asset computes changes: everything downstream becomes stale."""
 
@@ -244,10 +244,11 @@ class Plan:
             case _:
                 policies = [u for v in self.variants for u in self.policy_units(v, "predictions")]
                 policies += self.scored_units()
+                driven = [u for v in self.variants for u in self.policy_units(v, "rollouts")]
                 shown = {
                     "benchmark_report": [Unit("benchmark_table"), Unit("rollout_video"), *self.curves()],
-                    "mcap_log": [Unit("rollout_video")],
-                    "rerun_recording": [Unit("rollout_video"), Unit("multimodality_floor")],
+                    "mcap_log": driven,
+                    "rerun_recording": [*driven, Unit("multimodality_floor")],
                 }
                 return [*shown.get(unit.kind, []), *policies]
 

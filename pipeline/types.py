@@ -335,6 +335,10 @@ class Scenes:
     asked: np.ndarray
     chunks: np.ndarray
 
+    def first(self, count: int) -> "Scenes":
+        """The same of fewer start states."""
+        return Scenes({key: values[:count] for key, values in self.shown.items()}, self.asked, self.chunks[:count])
+
 
 @dataclass(frozen=True)
 class Rollouts:

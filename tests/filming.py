@@ -4,7 +4,7 @@ The picture of a frame is that of its global number.
 """
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import av
@@ -105,12 +105,12 @@ def filmed_v3(folder: Path, recording: Recording, encoder: str = "libx264", opti
     return folder
 
 
-def with_pictures(folder: Path, recording: Recording) -> Path:
+def with_pictures(folder: Path, recording: Recording, encode: Callable[[int], bytes] = as_png) -> Path:
     """The data files keep a PNG a frame."""
     write_v2(folder, recording)
     _declare(folder, "image", None)
     for episode, frames in enumerate(recording.slices()):
-        kept = [{"bytes": as_png(number), "path": None} for number in range(frames.start, frames.stop)]
+        kept = [{"bytes": encode(number), "path": None} for number in range(frames.start, frames.stop)]
         edit_table(
             folder / f"data/chunk-000/episode_{episode:06d}.parquet",
             lambda table, kept=kept: table.append_column(KEY, pa.array(kept)),

@@ -63,8 +63,8 @@ def view_episode(
     path = save or session.store.dataset(target.key) / "view.rrd"
     path.parent.mkdir(parents=True, exist_ok=True)
     floors = mean_error_floors(plan) if plan.is_fresh(Unit("multimodality_floor")) else {}
-    shown, name = [int(position[0])], f"{target.key} {episode}"
-    for why in to_rerun.write_rerun(path, demos, semantics, predictions, shown, name=name, floors=floors):
+    shown, look = [int(position[0])], {"name": f"{target.key} {episode}", "floors": floors, "everyone": names}
+    for why in to_rerun.write_rerun(path, demos, semantics, predictions, shown, **look):
         session.console.print(f"Left out: {why}", soft_wrap=True)
     if save:
         session.console.print(f"Written to {save}. Open it with: rerun --bind 127.0.0.1 {save}", soft_wrap=True)

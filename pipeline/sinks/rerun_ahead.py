@@ -7,7 +7,8 @@
 What belongs here: chunks of joints as lines in a plane of their own, because a plot over time cannot depend on the cursor. What
 does not: positions in a plane (`to_rerun`) and in space (`rerun_scenes`).
 
-A lane is as high as the joint's recorded range in the episode; to the right is the future, as long as the longest chunk.
+A lane is as high as the joint's recorded range in the episode; to the right is the future, as long as the longest chunk. Below the
+lanes are the seconds.
 """
 
 from collections.abc import Sequence
@@ -16,11 +17,16 @@ from typing import Any
 import numpy as np
 
 from pipeline.sinks.palette import GRID, INK, MUTED, is_baseline
+from pipeline.sinks.rerun_lines import as_strips
 from pipeline.sinks.rerun_rollouts import FRAME, TIME
 from pipeline.types import ACTION, Demonstrations, Predictions
 
-LANE, WIDE = 0.8, 1.6
-"""Of each unit of height the part that a lane fills; how wide all are for a unit of height."""
+LANE = 0.8
+"""Of each unit of height the part that a lane fills."""
+ASPECT = 0.75
+"""Width over height of a view that stands alone in its column, on a window of 1500 × 900 px."""
+LEFT, RIGHT, TOP, BOTTOM = 0.42, 0.05, 0.2, 0.6
+"""Room for names and seconds: left and right in widths of the lanes, above and below in units of height."""
 POINTS = 9
 """Of a longer chunk so many actions are drawn, evenly spread, with the first and the last."""
 HZ = 10.0
@@ -40,14 +46,17 @@ def send_ahead(
     episode: int,
     predictions: Sequence[Predictions],
     colours: Sequence,
+    views: int,
 ) -> None:
+    """`views` are how many stand in the column: the lanes get the shape that is left for them."""
     import rerun as rr
 
     shown = with_chunks(predictions)
     if not shown:
         return
     frames = demos.episode(episode)
-    lanes = _Lanes(demos.columns[ACTION][frames], max(predictions[p].actions.shape[2] for p in shown))
+    longest = max(predictions[p].actions.shape[2] for p in shown)
+    lanes = _Lanes(demos.columns[ACTION][frames], longest, views)
     root = f"{root}/ahead"
     every = max(round(demos.fps / HZ), 1)
     _send_names(recording, root, demos, lanes)
@@ -73,11 +82,11 @@ def send_ahead(
 class _Lanes:
     """Where values of an episode's recorded actions [n, A] lie, when the longest chunk has `longest` actions."""
 
-    def __init__(self, recorded: np.ndarray, longest: int):
+    def __init__(self, recorded: np.ndarray, longest: int, views: int):
         self._recorded, self.longest, self.count = recorded, longest, recorded.shape[1]
         self._low, high = recorded.min(axis=0), recorded.max(axis=0)
         self._range = np.where(high > self._low, high - self._low, 1.0)
-        self.wide = WIDE * self.count
+        self.wide = _wide(self.count, views)
 
     def drawn(self, values: np.ndarray) -> list[np.ndarray]:
         """Actions from a frame on [m, K, A] → m × A lines [points, 2]; the second axis points down."""
@@ -101,7 +110,7 @@ def _send(recording: Any, entity: str, demos: Demonstrations, frames: slice, pla
 
     seconds = demos.timestamps[frames][places]
     times = [rr.TimeColumn(TIME, duration=seconds), rr.TimeColumn(FRAME, sequence=places)]
-    columns = rr.LineStrips2D.columns(strips=lines).partition([len(lines) // len(places)] * len(places))
+    columns = rr.LineStrips2D.columns(strips=as_strips(lines, 2)).partition([len(lines) // len(places)] * len(places))
     recording.send_columns(entity, times, columns)
 
 
@@ -113,18 +122,29 @@ def _send_names(recording: Any, root: str, demos: Demonstrations, lanes: _Lanes)
     bottoms = [[[0, y + LANE / 2], [lanes.wide, y + LANE / 2]] for y in middles]
     now = [[0, -0.1], [0, lanes.count]]
     recording.log(f"{root}/lanes", rr.LineStrips2D([*bottoms, now], colors=[GRID.rgb_on_dark], radii=-0.5), static=True)
+    end_s = (lanes.longest - 1) / demos.fps
+    seconds = [f"+{end_s * share:.2f} s" if share else "now" for share in (0, 0.5, 1)]
+    below = [[share * lanes.wide, lanes.count + 0.1] for share in (0, 0.5, 1)]
+    ticks = rr.Points2D(below, labels=seconds, radii=-0.1, colors=[MUTED.rgb_on_dark], show_labels=True)
+    recording.log(f"{root}/seconds", ticks, static=True)
     names = [f"{n} ({unit})" if unit else n for n, unit in zip(feature.names, feature.units, strict=True)]
-    places = [[-0.16 * lanes.wide, y] for y in middles]
+    places = [[-0.22 * lanes.wide, y] for y in middles]
     labels = rr.Points2D(places, labels=names, radii=-0.1, colors=[MUTED.rgb_on_dark], show_labels=True)
     recording.log(f"{root}/names", labels, static=True)
 
 
-def ahead_view(root: str, demos: Demonstrations, predictions: Sequence[Predictions]) -> Any:
+def _wide(joints: int, views: int) -> float:
+    """How wide the lanes of so many joints are."""
+    return ASPECT * views * (TOP + joints + BOTTOM) / (LEFT + 1 + RIGHT)
+
+
+def ahead_view(root: str, demos: Demonstrations, predictions: Sequence[Predictions], views: int) -> Any:
     import rerun.blueprint as rrb
 
     longest = max(predictions[p].actions.shape[2] for p in with_chunks(predictions))
     count = len(demos.features[ACTION].names)
-    bounds = rrb.VisualBounds2D(x_range=[-0.34 * WIDE * count, 1.05 * WIDE * count], y_range=[-0.2, count + 0.1])
+    wide = _wide(count, views)
+    bounds = rrb.VisualBounds2D(x_range=[-LEFT * wide, (1 + RIGHT) * wide], y_range=[-TOP, count + BOTTOM])
     return rrb.Spatial2DView(
         origin=f"{root}/ahead",
         name=f"the next {(longest - 1) / demos.fps:.1f} s from the cursor on · white: recorded",

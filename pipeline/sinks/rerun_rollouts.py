@@ -1,9 +1,8 @@
-"""Roll-outs in a Rerun recording: what there was to see, with the chunk predicted just now, and the video of it.
+"""Roll-outs in a Rerun recording: what there was to see, with the chunk predicted just now, all policies side by side.
 
     /rollouts/<policy>/<observations>/start_003/<thing>    in the plane or in space, as the simulator is drawn
-    /rollouts/<policy>/<observations>/video                the video of the report, on the same clock
 
-What belongs here: shapes as Rerun's entities, and their tab. What does not: where things are (`simulate.scene`), held-out episodes
+What belongs here: shapes as Rerun's entities, and their tabs. What does not: where things are (`simulate.scene`), held-out episodes
 (`to_rerun`).
 
 The way of the effector is there from the start to the end, so that a chunk can be held against what then happened.
@@ -11,50 +10,55 @@ The way of the effector is there from the start to the end, so that a chunk can 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.simulate.scene import Camera, Drawing, Shape, drawing_of
 from pipeline.sinks.palette import ROLES
-from pipeline.sinks.rollout_video import Video
+from pipeline.sinks.rerun_lines import as_strips
 from pipeline.types import Rollouts, Scenes
 
 TIME, FRAME = "time", "frame"
 
 NEARER = 0.6
-"""A viewer sees a wider angle than the video does, so its eye stands nearer."""
+"""A viewer sees a wider angle than a picture of the drawing does, so its eye stands nearer."""
 
 
 @dataclass(frozen=True)
 class Driven:
-    """Roll-outs to show, with what there was to see of them and their video."""
+    """Roll-outs to show: of the first start states, as many as there are scenes."""
 
     rollouts: Rollouts
     scenes: Scenes
-    video: Video
-    mp4: Path
 
     @property
     def drawing(self) -> Drawing:
         return drawing_of(self.rollouts.simulator)
 
+    @property
+    def start_states(self) -> list[int]:
+        """The numbers of those shown."""
+        return self.rollouts.start_states[: len(self.scenes.chunks)].tolist()
+
+    def ended(self, row: int) -> str:
+        word = self.drawing.done if self.rollouts.success[row] else "failed"
+        return f"{word}, {self.rollouts.steps[row] / self.drawing.fps:.1f} s"
+
     def words(self, row: int) -> str:
         """Which start state, and how it ended."""
-        word = self.drawing.done if self.rollouts.success[row] else "failed"
-        return f"start state {self.rollouts.start_states[row]}: {word}, {self.rollouts.steps[row] / self.drawing.fps:.1f} s"
+        return f"start state {self.rollouts.start_states[row]}: {self.ended(row)}"
 
-    def root(self, row: int | None = None) -> str:
-        """The entity of all, or of one start state, by its number."""
+    def root(self, row: int) -> str:
+        """The entity of one start state, by its number."""
         import rerun as rr
 
-        parts = ["rollouts", self.rollouts.policy, self.rollouts.observations]
-        return rr.new_entity_path(parts + ([] if row is None else [f"start_{self.rollouts.start_states[row]:03d}"]))
+        number = self.rollouts.start_states[row]
+        return rr.new_entity_path(["rollouts", self.rollouts.policy, self.rollouts.observations, f"start_{number:03d}"])
 
 
 def send_rollouts(recording: Any, driven: Driven) -> None:
-    """All start states of one policy, and its video."""
+    """All start states of one policy."""
     import rerun as rr
 
     fps = driven.drawing.fps
@@ -64,25 +68,24 @@ def send_rollouts(recording: Any, driven: Driven) -> None:
             recording.log(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for shape in driven.drawing.shapes(driven.scenes, row):
             send_shape(recording, f"{root}/{shape.name}", shape, np.arange(len(shape.points)) / fps)
-    _send_video(recording, f"{driven.root()}/video", driven)
 
 
-def rollouts_tab(driven: Driven) -> Any:
-    """A view for each start state, named after how it ended, and the video below them."""
+def rollouts_tabs(driven: Sequence[Driven]) -> list[Any]:
+    """A tab a start state; in it a view for each policy, named after how it ended."""
     import rerun.blueprint as rrb
 
-    views = [_view(driven, row) for row in range(len(driven.scenes.chunks))]
-    video = rrb.Spatial2DView(
-        origin=f"{driven.root()}/video", name="the same as a video (H.264: the native viewer asks ffmpeg to decode it)"
-    )
-    title = f"roll-outs: {driven.rollouts.policy} ({driven.rollouts.observations})"
-    return rrb.Vertical(rrb.Grid(*views, grid_columns=4), video, row_shares=[2, 1], name=title)
+    views: dict[int, list[Any]] = {}
+    for one in driven:
+        for row, number in enumerate(one.start_states):
+            views.setdefault(number, []).append(_view(one, row))
+    return [rrb.Grid(*views[number], name=f"start state {number}") for number in sorted(views)]
 
 
 def _view(driven: Driven, row: int) -> Any:
     import rerun.blueprint as rrb
 
-    drawing, name = driven.drawing, driven.words(row)
+    drawing = driven.drawing
+    name = f"{driven.rollouts.policy} ({driven.rollouts.observations}): {driven.ended(row)}"
     if not isinstance(drawing.view, Camera):
         (left, top), (right, bottom) = drawing.view.low, drawing.view.high
         bounds = rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom])
@@ -121,7 +124,7 @@ def send_shape(recording: Any, entity: str, shape: Shape, seconds: np.ndarray) -
     if still:
         recording.log(entity, lines.from_fields(strips=strips[0]), static=True)
         return
-    columns = lines.columns(strips=[line for frame in strips for line in frame])
+    columns = lines.columns(strips=as_strips([line for frame in strips for line in frame], dimensions))
     recording.send_columns(entity, times, columns.partition([len(frame) for frame in strips]))
 
 
@@ -138,17 +141,3 @@ def _mesh_looks(shape: Shape, colour: Sequence[int]) -> Any:
     light = 0.7 + 0.3 * np.abs(normals[:, 2:]) - 0.12 * np.abs(normals[:, 1:2])
     colours = np.repeat(np.round(light * np.array(colour)).astype(np.uint8), corners, axis=0)
     return rr.Mesh3D.from_fields(triangle_indices=triangles, vertex_colors=colours)
-
-
-def _send_video(recording: Any, entity: str, driven: Driven) -> None:
-    """The video and, on the simulator's clock, which of its pictures is due; what is held at its end is left out."""
-    import rerun as rr
-
-    asset = rr.AssetVideo(path=driven.mp4)
-    recording.log(entity, asset, static=True)
-    nanos = asset.read_frame_timestamps_nanos()
-    seconds = np.asarray(nanos) * 1e-9 * driven.video.speed
-    end_s = driven.rollouts.steps[: len(driven.scenes.chunks)].max() / driven.drawing.fps
-    drawn = seconds < end_s + 0.5 * driven.video.speed / driven.video.fps
-    times = [rr.TimeColumn(TIME, duration=seconds[drawn])]
-    recording.send_columns(entity, times, rr.VideoFrameReference.columns_nanos(np.asarray(nanos)[drawn]))

@@ -16,6 +16,7 @@ import numpy as np
 
 from pipeline.simulate.recorded import Arm, things_of
 from pipeline.sinks.palette import INK, MUTED, ROLES, is_baseline
+from pipeline.sinks.rerun_lines import as_strips
 from pipeline.sinks.rerun_rollouts import FRAME, NEARER, TIME, send_shape
 from pipeline.types import STATE, Demonstrations, Predictions
 
@@ -51,7 +52,7 @@ def send_arm(
         recording.log(entity, _mesh(link), static=True)
         recording.send_columns(entity, times, rr.Transform3D.columns(translation=places, quaternion=turns))
     tips = arm.fingertips(state)
-    recording.log(f"{root}/way", rr.LineStrips3D([tips], colors=[MUTED.rgb_on_dark], radii=[0.001]), static=True)
+    recording.log(f"{root}/way", rr.LineStrips3D([tips], colors=[MUTED.rgb_on_dark], radii=[-0.75]), static=True)
     for one, colour in zip(predictions, colours, strict=True):
         if not is_baseline(one.policy) and one.actions.shape[2] > 1:
             _send_chunks(
@@ -72,8 +73,10 @@ def _send_chunks(
     anchors = one.anchors[inside]
     begin = arm.fingertips(demos.columns[STATE][anchors])[:, None]
     strips = np.concatenate([begin, arm.fingertips(one.actions[0, inside][:, ahead])], axis=1)
-    lines = rr.LineStrips3D.columns(strips=list(strips), colors=[colour] * len(strips), radii=[0.0012] * len(strips))
-    recording.send_columns(rr.new_entity_path(entity), _times(demos.timestamps[frames], anchors - frames.start), lines)
+    path = rr.new_entity_path(entity)
+    recording.log(path, rr.LineStrips3D.from_fields(colors=[colour], radii=[-1.5]), static=True)
+    lines = rr.LineStrips3D.columns(strips=as_strips(list(strips), 3))
+    recording.send_columns(path, _times(demos.timestamps[frames], anchors - frames.start), lines)
 
 
 def arm_view(root: str, arm: Arm) -> Any:

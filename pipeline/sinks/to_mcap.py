@@ -154,8 +154,8 @@ def _write_episode(log: _Log, demos: Demonstrations, episode: int, streams, feed
 
 
 def _write_rollouts(log: _Log, demos: Demonstrations, driven: Sequence["Driven"], clock: _Clock) -> None:
-    """Those that there is something to see of; from each start state, all policies at once."""
-    rows = [(int(one.rollouts.start_states[row]), one, row) for one in driven for row in range(len(one.scenes.chunks))]
+    """From each start state, all policies at once."""
+    rows = [(number, one, row) for one in driven for row, number in enumerate(one.start_states)]
     for number in sorted({number for number, _, _ in rows}):
         together = [(one, row) for found, one, row in rows if found == number]
         streams = [stream for one, row in together for stream in _rollout_streams(demos, one, row)]

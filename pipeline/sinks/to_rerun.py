@@ -18,7 +18,7 @@ shown by their first seed, at the frames at which they were asked; elsewhere a s
 
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -35,7 +35,8 @@ from pipeline.sinks import replacing
 from pipeline.sinks.palette import BASELINES, INK, MUTED, is_baseline, policy_colours
 from pipeline.sinks.rerun_ahead import ahead_view, send_ahead, with_chunks
 from pipeline.sinks.rerun_cameras import Cameras, camera_entity
-from pipeline.sinks.rerun_rollouts import FRAME, TIME, Driven, rollouts_tab, send_rollouts
+from pipeline.sinks.rerun_lines import as_strips
+from pipeline.sinks.rerun_rollouts import FRAME, TIME, Driven, rollouts_tabs, send_rollouts
 from pipeline.sinks.rerun_scenes import arm_view, send_arm, send_things
 from pipeline.sinks.words import common_unit
 from pipeline.types import ACTION, STATE, Demonstrations, Predictions, Semantics
@@ -45,6 +46,11 @@ VIEWER = "rerun_cli"
 HIDDEN_AT_FIRST = ("constant_velocity", "mean_action")
 DISAGREES = 0.05
 """The share of a policy's answers, those with the largest errors, that are marked: there it disagrees with the recording."""
+MARKED = f"◆ a policy's largest {DISAGREES:.0%}"
+VIEW_BYTES, BESIDE = 25_000, 4
+"""What is written last, the layout and an index of all, takes so much for each view; views of an episode beside its joints'."""
+ROW_SHARE, ROOM_SHARE = 0.0355, 0.084
+"""The part of a tab's height that the error's view needs for a row of its legend, and for the rest, on a window 900 px high."""
 Rgb = tuple[int, int, int]
 
 
@@ -68,9 +74,10 @@ def write_rerun(
     name: str,
     driven: Sequence[Driven] = (),
     floors: Mapping[str, float] | None = None,
-    camera_bytes: int | None = None,
+    most_bytes: int | None = None,
+    everyone: Iterable[str] = (),
 ) -> list[str]:
-    """Write one `.rrd` file that opens with its own layout: a tab an episode, and one for the roll-outs of each policy shown.
+    """Write one `.rrd` file that opens with its own layout: a tab an episode, and one for each start state of roll-outs.
 
     Parameters:
         predictions: of any policies; episodes that a policy was not asked about have no line of it.
@@ -78,7 +85,8 @@ def write_rerun(
         name: what the viewer calls the recording.
         driven: roll-outs to show.
         floors: observation set → the floor of the mean error of the first action.
-        camera_bytes: what cameras may take together; None is no limit.
+        most_bytes: how large the file may be with cameras in it; None is no limit. Nothing but cameras is left out.
+        everyone: all policies of the benchmark, where some are shown: each keeps its colour.
 
     Returns: why pictures of cameras are missing, if they are.
 
@@ -87,8 +95,9 @@ def write_rerun(
     """
     import rerun as rr
 
-    lines = [*_recorded_series(), *_policy_series(predictions)]
-    looks, arm, cameras = lines[2:], arm_of(demos), Cameras(demos, camera_bytes)
+    predictions = _in_order(predictions)
+    lines = [*_recorded_series(), *_policy_series(predictions, everyone)]
+    looks, arm, cameras = lines[2:], arm_of(demos), Cameras(demos)
     largest = _largest(demos, semantics, predictions)
     recording = rr.RecordingStream("demobench")
     with replacing(path) as temporary:
@@ -97,18 +106,25 @@ def write_rerun(
         recording.send_recording_name(name)
         recording.send_property("demobench", rr.AnyValues(**_properties(demos, semantics)))
         for episode in episodes:
-            root, frames = episode_root(demos, episode), demos.episode(episode)
+            root = episode_root(demos, episode)
             _send_joints(recording, demos, semantics, predictions, episode, lines)
             _send_error(recording, demos, semantics, predictions, episode, looks, floors or {}, largest)
-            cameras.send(recording, root, episode, partial(_first_times, demos, frames))
             if has_paths(demos, semantics):
                 _send_paths(recording, demos, semantics, predictions, episode, looks)
             else:
-                send_ahead(recording, root, demos, episode, predictions, [s.colour for s in looks])
+                views = 1 + len(demos.cameras) + bool(arm)
+                send_ahead(recording, root, demos, episode, predictions, [s.colour for s in looks], views)
             if arm:
                 send_arm(recording, f"{root}/scene", demos, episode, arm, predictions, [s.colour for s in looks])
         for one in driven:
             send_rollouts(recording, one)
+        recording.flush()
+        if most_bytes is not None:
+            views = len(episodes) * (len(semantics.kinds) + BESIDE) + sum(len(one.start_states) for one in driven)
+            cameras.room = most_bytes - temporary.stat().st_size - VIEW_BYTES * views
+        for episode in episodes:
+            times = partial(_first_times, demos, demos.episode(episode))
+            cameras.send(recording, episode_root(demos, episode), episode, times)
         recording.send_blueprint(_blueprint(demos, semantics, predictions, episodes, driven, cameras, arm))
         recording.flush()
         recording.disconnect()
@@ -166,9 +182,14 @@ def _recorded_series() -> list[Series]:
     return [Series("state", (112, 120, 130), 2.0), Series("recorded action", INK.rgb_on_dark, 3.0)]
 
 
-def _policy_series(predictions: Sequence[Predictions]) -> list[Series]:
+def _in_order(predictions: Sequence[Predictions]) -> list[Predictions]:
+    """Trained policies, then baselines, then those that are hidden at first: of a long legend the end is cut off."""
+    return sorted(predictions, key=lambda one: (is_baseline(one.policy), one.policy in HIDDEN_AT_FIRST))
+
+
+def _policy_series(predictions: Sequence[Predictions], everyone: Iterable[str]) -> list[Series]:
     """A line a policy × observation set; a policy keeps its colour, a second set is drawn paler."""
-    colours = policy_colours(one.policy for one in predictions)
+    colours = policy_colours([*everyone, *(one.policy for one in predictions)])
     sets: dict[str, list[str]] = {}
     for one in predictions:
         sets.setdefault(one.policy, []).append(one.observations)
@@ -282,7 +303,7 @@ def _send_error(recording, demos, semantics, predictions, episode, series, floor
     marked = np.where(errors >= np.array(largest), errors, np.nan)[:, learned]
     if np.isfinite(marked).any():
         looks = rr.SeriesPoints(
-            names=[f"◆ {series[p].name}" for p in learned],
+            names=[MARKED] * len(learned),  # one row of the legend for all of them
             colors=[series[p].colour for p in learned],
             markers=["diamond"] * len(learned),
             marker_sizes=[4.0] * len(learned),
@@ -313,7 +334,8 @@ def _send_paths(recording, demos, semantics, predictions, episode, series) -> No
             continue
         entity = rr.new_entity_path([*root.strip("/").split("/"), one.policy, one.observations])
         chunks = np.concatenate([state[one.anchors[inside] - frames.start][:, None], one.actions[0, inside]], axis=1)
-        strips = rr.LineStrips2D.columns(strips=list(chunks), colors=[look.colour] * len(inside))
+        recording.log(entity, rr.LineStrips2D.from_fields(colors=[look.colour]), static=True)
+        strips = rr.LineStrips2D.columns(strips=as_strips(list(chunks), 2))
         recording.send_columns(entity, _times(demos, frames, one.anchors[inside] - frames.start), strips)
 
 
@@ -327,9 +349,8 @@ def _blueprint(demos, semantics, predictions, episodes, driven: Sequence[Driven]
     """A tab an episode: joints in a grid, the error below them, what there is to see beside them; then roll-outs."""
     import rerun.blueprint as rrb
 
-    tabs = [_tab(demos, semantics, predictions, episode, cameras, arm) for episode in episodes] + [
-        rollouts_tab(one) for one in driven
-    ]
+    tabs = [_tab(demos, semantics, predictions, episode, cameras, arm) for episode in episodes]
+    tabs += rollouts_tabs(driven)
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0, name="held-out episodes and roll-outs" if driven else "held-out episodes"),
         rrb.TimePanel(state="collapsed", timeline=TIME),
@@ -342,8 +363,10 @@ def _tab(demos, semantics, predictions, episode: int, cameras: Cameras, arm: Arm
     import rerun.blueprint as rrb
 
     root = episode_root(demos, episode)
-    joints = rrb.Grid(*_joint_views(demos, root))
-    plots = rrb.Vertical(joints, _error_view(demos, root, episode), row_shares=[2, 1]) if predictions else joints
+    plots = rrb.Grid(*_joint_views(demos, root, episode))
+    if predictions:
+        shares = _shares(predictions)
+        plots = rrb.Vertical(plots, _error_view(demos, root, episode), row_shares=shares)
     seen = [
         rrb.Spatial2DView(origin=camera_entity(root, camera), name=f"camera {camera.key}")
         for camera in cameras.shown(episode)
@@ -351,18 +374,56 @@ def _tab(demos, semantics, predictions, episode: int, cameras: Cameras, arm: Arm
     if has_paths(demos, semantics):
         hidden = [f"- {root}/path/{policy}/**" for policy in BASELINES]
         contents = ["+ $origin/**", *hidden]
-        seen.append(rrb.Spatial2DView(origin=f"{root}/path", contents=contents, name="path and predicted chunks"))
+        unit = common_unit(demos.features[ACTION].units) or "unit unknown"
+        seen.append(
+            rrb.Spatial2DView(
+                origin=f"{root}/path",
+                contents=contents,
+                name=f"the way recorded, and the chunks predicted now ({unit})",
+                visual_bounds=_bounds(demos, semantics),
+            )
+        )
     if arm:
         seen.append(arm_view(f"{root}/scene", arm))
     if not has_paths(demos, semantics) and with_chunks(predictions):
-        seen.append(ahead_view(root, demos, predictions))
+        seen.append(ahead_view(root, demos, predictions, len(seen) + 1))
     title = f"episode {demos.episode_ids[episode]}"
     if not seen:
         return rrb.Vertical(plots, name=title)
     return rrb.Horizontal(plots, rrb.Vertical(*seen), column_shares=[3, 2], name=title)
 
 
-def _joint_views(demos: Demonstrations, root: str) -> list[Any]:
+def _shares(predictions: Sequence[Predictions]) -> list[float]:
+    """Heights of the joints and of the error: its legend is seen whole, but for those that are hidden at first."""
+    rows = 1 + sum(one.policy not in HIDDEN_AT_FIRST for one in predictions)  # the floor, and a row each
+    error = float(np.clip(ROW_SHARE * rows + ROOM_SHARE, 1 / 3, 1 / 2))
+    return [1 - error, error]
+
+
+def _bounds(demos: Demonstrations, semantics: Semantics) -> Any:
+    """The plane of all episodes, so that it stays where it is from one to the next."""
+    import rerun.blueprint as rrb
+
+    both = np.concatenate([demos.columns[STATE][:, list(semantics.state_column)], demos.columns[ACTION]])
+    low, high = both.min(axis=0), both.max(axis=0)
+    margin = 0.04 * (high - low).max()
+    (left, top), (right, bottom) = low - margin, high + margin
+    return rrb.VisualBounds2D(x_range=[float(left), float(right)], y_range=[float(top), float(bottom)])
+
+
+def _range(demos: Demonstrations, episode: int, room: float = 0.0) -> Any:
+    """The seconds that a plot shows, with room after the end; far enough for a second number on a small plot's axis, which names
+    powers of ten only."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    end_s = max(float(demos.timestamps[demos.episode(episode)].max()), 0.1) * (1 + room)
+    end_s = 10.5 if 5 < end_s < 10.5 else end_s
+    boundary = rr.TimeRangeBoundary.absolute
+    return rrb.archetypes.TimeAxis(view_range=rr.TimeRange(start=boundary(seconds=0.0), end=boundary(seconds=end_s)))
+
+
+def _joint_views(demos: Demonstrations, root: str, episode: int) -> list[Any]:
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -374,6 +435,7 @@ def _joint_views(demos: Demonstrations, root: str) -> list[Any]:
             rrb.TimeSeriesView(
                 origin=rr.new_entity_path([root.strip("/"), "joints", entity]),
                 name=title,
+                axis_x=_range(demos, episode),
                 plot_legend=rrb.PlotLegend(visible=False),
             )
         )
@@ -382,19 +444,13 @@ def _joint_views(demos: Demonstrations, root: str) -> list[Any]:
 
 def _error_view(demos: Demonstrations, root: str, episode: int) -> Any:
     """The error over time. It holds the legend of the whole tab, in room left for it after the episode's end."""
-    import rerun as rr
     import rerun.blueprint as rrb
 
     unit = common_unit(demos.features[ACTION].units)
     title = f"mean |error| of the first action ({unit or 'unit unknown'})"
-    end_s = float(demos.timestamps[demos.episode(episode)].max())
-    room = rr.TimeRange(
-        start=rr.TimeRangeBoundary.absolute(seconds=0.0),
-        end=rr.TimeRangeBoundary.absolute(seconds=max(end_s, 0.1) * 1.4),
-    )
     return rrb.TimeSeriesView(
         origin=f"{root}/error",
-        name=f"{title} · ◆ a policy's largest {DISAGREES:.0%} · above, white: recorded",
-        axis_x=rrb.archetypes.TimeAxis(view_range=room),
+        name=f"{title} · {MARKED} · above, white: recorded",
+        axis_x=_range(demos, episode, room=0.4),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop),
     )

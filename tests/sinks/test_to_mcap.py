@@ -244,7 +244,7 @@ def test_roll_outs_follow_the_episodes_each_start_state_by_itself(tmp_path, demo
     block = Feature(BLOCK, ("block_x", "block_y", "block_angle"), ("px", "px", "rad"))
     demos = replace(demos, features=dict(demos.features) | {BLOCK: block})
     rollouts = make_driven((10, 6))
-    driven = Driven(rollouts, rollouts.scenes, None, None)
+    driven = Driven(rollouts, rollouts.scenes)
     written = write_mcap(tmp_path / "a.mcap", demos, semantics, [], [0], metadata={}, driven=[driven])
     found, root = read(tmp_path / "a.mcap"), "/rollout/mlp_k04/state"
     said = found[f"{root}/start_state"]

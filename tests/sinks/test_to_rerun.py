@@ -11,6 +11,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from PIL import Image
 from rerun.chunk import RrdReader
 
 from pipeline.errors import StoreError
@@ -19,8 +20,8 @@ from pipeline.lerobot_format.read import read_dataset
 from pipeline.simulate.so101 import POSE
 from pipeline.simulate.so101_arm import NAMES, PAN_AXIS_X_M, UNITS
 from pipeline.sinks import to_rerun
+from pipeline.sinks.palette import TRAINED
 from pipeline.sinks.rerun_rollouts import Driven
-from pipeline.sinks.rollout_video import write_video
 from pipeline.sinks.to_rerun import episodes_in, has_paths, view, write_rerun
 from pipeline.types import ACTION, STATE, Feature, Scenes
 from tests.filming import (
@@ -55,6 +56,16 @@ def column(chunks: list, ending: str) -> list:
     tables = [t for t in tables if any(name.endswith(ending) for name in t.schema.names)]
     tables.sort(key=lambda t: t["frame"][0].as_py() if "frame" in t.schema.names else -1)
     return [value for t in tables for name in t.schema.names if name.endswith(ending) for value in t[name].to_pylist()]
+
+
+def names_in_blueprint(path: Path) -> list[str]:
+    """What its layout calls tabs and views."""
+    reader = RrdReader(path)
+    found = []
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        table = chunk.to_record_batch()
+        found += [v for n in table.schema.names if n.endswith("display_name") for v in table[n].to_pylist()]
+    return sorted(name for names in found for name in names)
 
 
 @pytest.fixture
@@ -164,9 +175,9 @@ def test_no_predictions_at_all(tmp_path, demos, semantics):
 
 
 @pytest.fixture
-def driven(tmp_path) -> Driven:
-    rollouts, mp4 = make_driven(), tmp_path / "state.mp4"
-    return Driven(rollouts, rollouts.scenes, write_video(mp4, tmp_path / "state.png", rollouts, rollouts.scenes), mp4)
+def driven() -> Driven:
+    rollouts = make_driven()
+    return Driven(rollouts, rollouts.scenes)
 
 
 def test_roll_outs_stand_under_the_numbers_of_their_start_states(tmp_path, demos, semantics, driven):
@@ -188,16 +199,19 @@ def test_roll_outs_stand_under_the_numbers_of_their_start_states(tmp_path, demos
     assert episodes_in(path) == {7}, "roll-outs are no held-out episodes"
 
 
-def test_the_video_runs_on_the_clock_of_the_simulator(tmp_path, demos, semantics, driven):
-    write_rerun(tmp_path / "a.rrd", demos, semantics, [], [0], name="a", driven=[driven])
-    video = read(tmp_path / "a.rrd")["/rollouts/mlp_k04/state/video"]
-    [blob] = column([chunk for chunk in video if chunk.is_static], "AssetVideo:blob")
-    assert bytes(blob[0]) == driven.mp4.read_bytes()
-    due = [chunk for chunk in video if not chunk.is_static]
-    seconds = [t.total_seconds() for t in column(due, "time")]
-    np.testing.assert_allclose(seconds, np.arange(13) / 10, atol=1e-3)
-    shown = [nanos[0] * 1e-9 for nanos in column(due, "VideoFrameReference:timestamp")]
-    np.testing.assert_allclose(shown, np.array(seconds) / driven.video.speed, atol=1e-3)
+def test_policies_stand_side_by_side_under_the_number_of_the_start_state(tmp_path, demos, semantics, driven):
+    still = replace(driven.rollouts, policy="hold_still", success=np.array([False, False, True]))
+    fewer = Driven(still, driven.scenes.first(2))
+    path = tmp_path / "a.rrd"
+    write_rerun(path, demos, semantics, [], [0], name="a", driven=[driven, fewer])
+    names = names_in_blueprint(path)
+    assert [name for name in names if name.startswith("start state")] == [f"start state {n}" for n in (7, 8, 9)]
+    ended = [name for name in names if name.startswith("hold_still")]
+    assert ended == ["hold_still (state): failed, 0.6 s", "hold_still (state): failed, 1.0 s"]
+    assert "mlp_k04 (state): on target, 1.2 s" in names
+    entities = read(path)
+    assert "/rollouts/hold_still/state/start_008/block" in entities
+    assert "/rollouts/hold_still/state/start_009/block" not in entities, "of that one there is nothing to see"
 
 
 def test_rerun_finds_no_fault_in_an_arm_either(tmp_path, demos, semantics):
@@ -207,9 +221,8 @@ def test_rerun_finds_no_fault_in_an_arm_either(tmp_path, demos, semantics):
     pose = np.tile(np.array([0.2, 0, 0.015, 1, 0, 0.2, 0.1], np.float32), (1, 5, 1))
     scenes = Scenes({STATE: state, POSE: pose}, np.array([0]), np.zeros((1, 1, 8, 6), np.float32))
     rollouts = replace(make_driven((4,), "so101"), scenes=scenes)
-    mp4, path = tmp_path / "a.mp4", tmp_path / "a.rrd"
-    one = Driven(rollouts, scenes, write_video(mp4, tmp_path / "a.png", rollouts, scenes), mp4)
-    write_rerun(path, demos, semantics, [], [0], name="a", driven=[one])
+    path = tmp_path / "a.rrd"
+    write_rerun(path, demos, semantics, [], [0], name="a", driven=[Driven(rollouts, scenes)])
     test_rerun_itself_finds_no_fault(path)
     cube = [chunk for chunk in read(path)["/rollouts/mlp_k04/state/start_007/cube"] if not chunk.is_static]
     corners = np.array(column(cube, "Mesh3D:vertex_positions"))
@@ -223,6 +236,25 @@ def test_two_observation_sets_are_told_apart(tmp_path, demos, semantics):
     static = [chunk for chunk in read(tmp_path / "a.rrd")["/episode_007/error"] if chunk.is_static]
     assert column(static, "SeriesLines:names") == [["mlp_k04 (position)", "mlp_k04 (pose)"]]
     assert len(set(column(static, "SeriesLines:colors")[0])) == 2
+
+
+def test_a_policy_keeps_its_colour_where_others_are_not_shown(tmp_path, demos, semantics):
+    one = make_predictions(demos, [0], "mlp_k16", 16)
+    write_rerun(tmp_path / "a.rrd", demos, semantics, [one], [0], name="a", everyone=["mlp_k01", "mlp_k04", "mlp_k16"])
+    static = [chunk for chunk in read(tmp_path / "a.rrd")["/episode_007/error"] if chunk.is_static]
+    red, green, blue = TRAINED[2].rgb_on_dark
+    assert column(static, "SeriesLines:colors") == [[(red << 24) + (green << 16) + (blue << 8) + 255]]
+
+
+def test_the_end_of_the_legend_is_what_is_hidden_at_first(tmp_path, demos, semantics):
+    names = ["mean_action", "hold_still", "mlp_k04", "constant_velocity", "mlp_k01"]
+    predictions = [make_predictions(demos, [0], name) for name in names]
+    write_rerun(tmp_path / "a.rrd", demos, semantics, predictions, [0], name="a")
+    static = [chunk for chunk in read(tmp_path / "a.rrd")["/episode_007/error"] if chunk.is_static]
+    assert column(static, "SeriesLines:names") == [
+        ["mlp_k04", "mlp_k01", "hold_still", "mean_action", "constant_velocity"]
+    ]
+    assert column(static, "SeriesLines:visible_series") == [[True, True, True, False, False]]
 
 
 def test_any_name_of_a_column_becomes_one_entity(tmp_path, demos, semantics):
@@ -308,22 +340,40 @@ def test_the_camera_at_time_t_shows_the_picture_of_the_frame_at_time_t(tmp_path,
         assert [shown[round(second, 3)] for second in due] == list(frames)
 
 
-def test_cameras_that_do_not_fit_or_cannot_be_read_are_left_out_and_said_so(tmp_path):
+def test_cameras_that_cannot_be_read_are_left_out_and_said_so(tmp_path):
     folder = filmed_v2(tmp_path / "set", tiny_recording(3, 12))
     write_mp4(folder / PATH_V2.format(episode_chunk=0, video_key=KEY, episode_index=1), range(5))
     demos, path = read_dataset(folder, name="set"), tmp_path / "a.rrd"
     semantics = resolve_semantics(demos)
-    room = (folder / PATH_V2.format(episode_chunk=0, video_key=KEY, episode_index=0)).stat().st_size + 500
-    left_out = write_rerun(path, demos, semantics, [], [0, 1, 2], name="a", camera_bytes=room)
-    assert len(left_out) == 2
-    assert "holds 5 pictures of episode 1, which has 12 frames" in left_out[0]
-    assert "episode 2 would make the recording too large" in left_out[1]
-    assert {entity for entity in read(path) if "/camera/" in entity} == {f"/episode_000/camera/{KEY}"}
+    (why,) = write_rerun(path, demos, semantics, [], [0, 1, 2], name="a", most_bytes=1_000_000)
+    assert "holds 5 pictures of episode 1, which has 12 frames" in why
+    assert {e for e in read(path) if "/camera/" in e} == {f"/episode_{e:03d}/camera/{KEY}" for e in (0, 2)}
     assert episodes_in(path) == {0, 1, 2}
     shutil.rmtree(folder / "videos")
     absent = read_dataset(folder, name="set")
     (why,) = write_rerun(path, absent, semantics, [], [0, 2], name="a")
     assert "that meta/ declares are not in" in why
+
+
+def test_a_recording_holds_as_many_cameras_as_it_may_be_large(tmp_path):
+    folder = with_pictures(tmp_path / "set", tiny_recording(3, 40), noise)
+    demos, path = read_dataset(folder, name="set"), tmp_path / "a.rrd"
+    semantics = resolve_semantics(demos)
+    one = sum(len(noise(number)) for number in range(40))
+    most = round(1.5 * one) + 500_000
+    left_out = write_rerun(path, demos, semantics, [], [0, 1, 2], name="a", most_bytes=most)
+    words = "would make the recording too large; `demobench view` shows it"
+    assert left_out == [f"camera '{KEY}': episode {number} {words}" for number in (1, 2)]
+    assert {entity for entity in read(path) if "/camera/" in entity} == {f"/episode_000/camera/{KEY}"}
+    assert one < path.stat().st_size < most
+    assert write_rerun(path, demos, semantics, [], [0, 1, 2], name="a") == []
+    assert path.stat().st_size > 3 * one
+
+
+def noise(number: int) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(np.random.default_rng(number).integers(0, 256, (48, 64, 3), np.uint8)).save(file, "png")
+    return file.getvalue()
 
 
 def test_the_floor_lies_in_the_error_of_the_whole_episode(tmp_path, demos, semantics, predictions):
@@ -348,7 +398,7 @@ def test_diamonds_mark_the_largest_errors_of_trained_policies_over_all_they_were
     np.testing.assert_allclose(marked[12:15, 0], 105, atol=1e-3)
     assert "/episode_009/error/disagrees" not in entities
     static = [chunk for chunk in entities["/episode_008/error/disagrees"] if chunk.is_static]
-    assert column(static, "SeriesPoints:names") == [["◆ mlp_k04"]]
+    assert column(static, "SeriesPoints:names") == [["◆ a policy's largest 5%"]]
 
 
 def test_an_so101_in_degrees_is_its_own_arm_and_one_in_other_units_is_not(tmp_path):
@@ -421,4 +471,6 @@ def test_joints_have_the_chunk_ahead_of_the_cursor_beside_what_came(tmp_path):
     assert [len(line) for line in recorded[-1]] == [1, 1, 1]
     names = column([c for c in entities["/episode_007/ahead/names"] if c.is_static], "Points2D:labels")
     assert names == [["x (px)", "y (px)", "z (px)"]]
+    seconds = column([c for c in entities["/episode_007/ahead/seconds"] if c.is_static], "Points2D:labels")
+    assert seconds == [["now", "+0.15 s", "+0.30 s"]]
     assert not [entity for entity in entities if "/path" in entity]
