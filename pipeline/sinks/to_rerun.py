@@ -16,6 +16,7 @@ Time lines: `time`, seconds from the start of each episode (episodes lie over on
 shown by their first seed, at the frames at which they were asked; elsewhere a series has a gap.
 """
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -43,6 +44,8 @@ from pipeline.types import ACTION, STATE, Demonstrations, Predictions, Semantics
 
 EPISODE = "episode_"
 VIEWER = "rerun_cli"
+START = f"import sys; from {VIEWER}.__main__ import main; sys.exit(main())"
+"""`python -m rerun_cli` ends with 0 whatever became of the viewer."""
 HIDDEN_AT_FIRST = ("constant_velocity", "mean_action")
 DISAGREES = 0.05
 """The share of a policy's answers, those with the largest errors, that are marked: there it disagrees with the recording."""
@@ -149,12 +152,12 @@ def view(path: Path, *, wait: bool = True) -> subprocess.Popen:
         raise StoreError(f"There is no recording at {path}. `demobench run` writes one.")
     if find_spec(VIEWER) is None:
         raise StoreError(
-            f"Rerun's viewer is not installed here; it comes with rerun-sdk: pip install rerun-sdk==0.41.0. Or open "
-            f"{path} on a machine that has it."
+            f"Rerun's viewer is not installed here; it comes with rerun-sdk: pip install rerun-sdk==0.41.0. Or open {path} on a "
+            "machine that has it; `demobench view` writes an episode to any file with --save."
         )
-    command = [sys.executable, "-m", VIEWER, "--bind", "127.0.0.1", "--port", "auto", str(path)]
+    command = [sys.executable, "-c", START, "--bind", "127.0.0.1", "--port", "auto", str(path)]
     try:
-        viewer = subprocess.Popen(command)
+        viewer = subprocess.Popen(command, env={"RUST_LOG": "error", **os.environ})
     except OSError as error:
         raise StoreError(f"The Rerun viewer cannot be started: {error}. `rerun {path}` opens the same file.") from error
     if wait:

@@ -162,6 +162,22 @@ def test_view_without_a_screen_is_one_message(place, first_run):
     assert len(out.stderr.splitlines()) <= 2
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere a window would open")
+@pytest.mark.parametrize(
+    "broken", [{"DISPLAY": ":9999"}, {"DISPLAY": ":9999", "RERUN_CLI_PATH": "/no/such/rerun"}], ids=["screen", "viewer"]
+)
+def test_a_viewer_that_cannot_open_is_one_message_that_names_a_file(place, first_run, broken):
+    environment = {key: value for key, value in ENVIRONMENT.items() if key != "WAYLAND_DISPLAY"} | broken
+    command = [sys.executable, "-m", "demobench.cli", "view", "tape", "0"]
+    out = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    said = " ".join(out.stderr.split())
+    assert out.returncode == 2
+    assert out.stderr.count("error: ") == 1
+    assert "Traceback" not in out.stderr
+    assert "error: Rerun's viewer could not be opened; what it said is above." in said
+    assert said.endswith("demobench view tape 0 --save FILE.rrd")
+
+
 def test_a_folder_is_viewed_where_its_name_is_another_s(place, first_run, tmp_path):
     """Its results are under a key with a hash, and with other settings than a bare `run`."""
     other = write_v3(tmp_path / "tape", tiny_recording(episodes=6, frames=30, seed=3))

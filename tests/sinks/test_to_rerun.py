@@ -1,10 +1,13 @@
 """Recordings are read back by Rerun's own reader and checked by its own command line."""
 
 import io
+import re
 import shutil
+import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,6 +43,8 @@ from tests.makers import tiny_recording
 
 from .driving import BLOCK, make_driven
 from .making import NASTY, make_demos, make_predictions, make_semantics
+
+RERUNS_PORT = 9876
 
 
 def read(path: Path) -> dict[str, list]:
@@ -290,20 +295,22 @@ def test_a_folder_that_cannot_be_written_is_one_clear_message(tmp_path, demos, s
         write_rerun(tmp_path / "file" / "a.rrd", demos, semantics, [], [0], name="a")
 
 
-def test_the_viewer_listens_on_this_machine_only(recording, monkeypatch):
-    started = []
-
-    class Viewer:
-        def __init__(self, command):
-            started.append(command)
-
-        def wait(self):
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(to_rerun.subprocess, "Popen", Viewer)
-    view(recording)
-    assert started[0][started[0].index("--bind") + 1] == "127.0.0.1"
-    assert started[0][-1] == str(recording)
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere a window would open")
+def test_the_viewer_listens_on_this_machine_only_and_beside_what_has_its_port(recording, monkeypatch, capfd):
+    """The real one, which listens before it looks for a screen and ends where there is none."""
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    for name, value in {"DISPLAY": ":9999", "RUST_LOG": "info", "NO_COLOR": "1"}.items():
+        monkeypatch.setenv(name, value)
+    with socket.socket() as taken:
+        with suppress(OSError):  # where somebody else has it, it is taken too
+            taken.bind(("127.0.0.1", RERUNS_PORT))
+            taken.listen()
+        ended = view(recording)
+    said = capfd.readouterr().err
+    host, port = re.search(r"Listening for gRPC connections on ([\d.]+):(\d+)", said).groups()
+    assert host == "127.0.0.1"
+    assert int(port) != RERUNS_PORT
+    assert ended.returncode, "a viewer that could not open says so"
 
 
 def test_viewing_what_is_not_there_says_what_to_do(tmp_path):
@@ -313,7 +320,7 @@ def test_viewing_what_is_not_there_says_what_to_do(tmp_path):
 
 def test_a_viewer_that_is_not_installed_is_one_clear_message(recording, monkeypatch):
     monkeypatch.setattr(to_rerun, "VIEWER", "a_viewer_that_nobody_installed")
-    with pytest.raises(StoreError, match=r"viewer is not installed here.*pip install rerun-sdk.*held_out\.rrd"):
+    with pytest.raises(StoreError, match=r"viewer is not installed here.*pip install rerun-sdk.*held_out\.rrd.*--save"):
         view(recording)
 
 
