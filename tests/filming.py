@@ -74,6 +74,19 @@ def numbers_in_packets(codec: str, packets: Sequence[bytes]) -> list[int]:
     return [number for numbers in shown for number in numbers]
 
 
+def decoded(codec: str, packets: tuple[bytes, ...]) -> list[np.ndarray]:
+    decoder = av.CodecContext.create("libdav1d" if codec == "av1" else codec, "r")
+    shown = [frame for packet in packets for frame in decoder.decode(av.Packet(packet))]
+    return [frame.to_ndarray(format="rgb24") for frame in [*shown, *decoder.decode(None)]]
+
+
+def pusher(picture: np.ndarray) -> np.ndarray:
+    """Where PushT's blue disc is [2], px of the picture."""
+    red, green, blue = picture.astype(int).transpose(2, 0, 1)
+    rows, columns = np.nonzero((blue - red > 60) & (blue - green > 40))
+    return np.array([columns.mean() + 0.5, rows.mean() + 0.5]) if len(rows) else np.full(2, np.nan)
+
+
 def filmed_v2(folder: Path, recording: Recording, encoder: str = "libx264", options: dict | None = None) -> Path:
     """A video an episode."""
     write_v2(folder, recording)

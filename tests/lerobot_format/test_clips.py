@@ -19,10 +19,12 @@ from tests.filming import (
     WITH_B_FRAMES,
     WITHOUT,
     as_png,
+    decoded,
     filmed_v2,
     filmed_v3,
     numbers_in_mp4,
     numbers_in_packets,
+    pusher,
     with_pictures,
     write_mp4,
 )
@@ -141,12 +143,6 @@ def test_fewer_pictures_in_the_data_files_than_frames(tmp_path):
         footage(folder).clip(1)
 
 
-def decoded(codec: str, packets: tuple[bytes, ...]) -> list[np.ndarray]:
-    decoder = av.CodecContext.create("libdav1d" if codec == "av1" else codec, "r")
-    shown = [frame for packet in packets for frame in decoder.decode(av.Packet(packet))]
-    return [frame.to_ndarray(format="rgb24") for frame in [*shown, *decoder.decode(None)]]
-
-
 @pytest.mark.parametrize("position", [0, 150])
 def test_real_pushers_stand_in_picture_t_where_the_state_of_frame_t_says(shared_data, position):
     demos = read_dataset(shared_data / "pusht_image", name="pusht_image")
@@ -160,13 +156,6 @@ def test_real_pushers_stand_in_picture_t_where_the_state_of_frame_t_says(shared_
         seen = np.array([pusher(picture) for picture in shown]) * 512 / 96
         away = [np.nanmedian(np.linalg.norm(np.roll(seen, lag, axis=0) - state, axis=1)) for lag in (-1, 0, 1)]
         assert away[1] == min(away) < 4, f"px away, a frame late, in step, a frame early: {away}"
-
-
-def pusher(picture: np.ndarray) -> np.ndarray:
-    """Where the blue disc is [2], px of the picture."""
-    red, green, blue = picture.astype(int).transpose(2, 0, 1)
-    rows, columns = np.nonzero((blue - red > 60) & (blue - green > 40))
-    return np.array([columns.mean() + 0.5, rows.mean() + 0.5]) if len(rows) else np.full(2, np.nan)
 
 
 def test_real_av1_is_streamed_and_cut_bit_for_bit(shared_data):

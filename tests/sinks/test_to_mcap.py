@@ -1,7 +1,9 @@
-"""MCAP files are read back by the tools that people have: the `mcap` reader with ROS 2 decoding, and rosbags."""
+"""MCAP files are read back by the tools that people have: the `mcap` reader with ROS 2 decoding, rosbags, and Rerun."""
 
 import json
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from rerun.chunk import RrdReader
 from rosbags.highlevel import AnyReader
 
 from pipeline.errors import StoreError
@@ -16,6 +19,7 @@ from pipeline.lerobot_format.quality import resolve_semantics
 from pipeline.lerobot_format.read import read_dataset
 from pipeline.sinks.rerun_rollouts import Driven
 from pipeline.sinks.to_mcap import GAP_S, count_messages, policy_topics, write_mcap
+from pipeline.sinks.to_rerun import START
 from pipeline.types import ACTION, STATE, Feature
 from tests.filming import (
     KEY,
@@ -123,6 +127,30 @@ def test_rosbags_reads_the_same(tmp_path, demos, semantics, predictions):
     assert counts["/joint_states"] == ("sensor_msgs/msg/JointState", 60)
     np.testing.assert_array_equal([m.position for m in read_back], predictions[1].actions[0, :, 0, :])
     assert texts == ["episode 8", "episode 9"]
+
+
+def test_reruns_own_loader_finds_no_fault_and_names_the_joints(tmp_path, demos, semantics, predictions):
+    rollouts = make_driven((10, 6))
+    driven = [Driven(rollouts, rollouts.scenes)]
+    block = Feature(BLOCK, ("block_x", "block_y", "block_angle"), ("px", "px", "rad"))
+    demos = replace(demos, features=dict(demos.features) | {BLOCK: block})
+    path, loaded = tmp_path / "a.mcap", tmp_path / "a.rrd"
+    write_mcap(path, demos, semantics, predictions, [1, 2], metadata={}, driven=driven)
+    for words in (["check", str(path)], ["convert", str(path), "-o", str(loaded)]):
+        done = subprocess.run([sys.executable, "-c", START, "mcap", *words], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    names, values = {}, {}
+    for chunk in RrdReader(loaded).stream():
+        table = chunk.to_record_batch()
+        if "SeriesLines:names" in table.schema.names:
+            names[chunk.entity_path] = table["SeriesLines:names"].to_pylist()[0]
+            values.setdefault(chunk.entity_path, []).extend(table["Scalars:scalars"].to_pylist())
+    for topic in ("/joint_states", "/joint_commands", POLICY, "/rollout/mlp_k04/state/joint_states"):
+        assert names[f"{topic}/position"] == ["x", "y"]
+    assert names["/rollout/mlp_k04/state/environment_state/position"] == list(block.names)
+    np.testing.assert_allclose(
+        sorted(values[f"{POLICY}/position"]), sorted(predictions[1].actions[0, :, 0, :].tolist())
+    )
 
 
 def test_predictions_for_some_episodes_only_leave_the_others_without(tmp_path, demos, semantics):
