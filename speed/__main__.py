@@ -6,7 +6,7 @@ from pipeline.lerobot_format.quality import resolve_semantics
 from pipeline.lerobot_format.read import load_source
 from pipeline.types import ObservationSet
 from pipeline.windows import make_windows
-from speed import inspect, loading, rollouts, statistics, training, windows
+from speed import inspect, loading, recordings, rollouts, statistics, training, windows
 
 
 def main() -> None:
@@ -29,6 +29,8 @@ def main() -> None:
         for line in [*windows.measure(cut), *training.measure(cut)]:
             print(line, flush=True)
     for line in rollouts.measure(cut, pose):
+        print(line, flush=True)
+    for line in recordings.measure(demos, semantics):
         print(line, flush=True)
     for line in [*statistics.measure(demos, semantics, pose), *inspect.measure(), *loading.measure()]:
         print(line)
