@@ -25,7 +25,7 @@ LANE = 0.8
 """Of each unit of height the part that a lane fills."""
 ASPECT = 0.75
 """Width over height of a view that stands alone in its column, on a window of 1500 × 900 px."""
-LEFT, RIGHT, TOP, BOTTOM = 0.42, 0.05, 0.2, 0.6
+LEFT, RIGHT, TOP, BOTTOM = 0.42, 0.12, 0.2, 0.6
 """Room for names and seconds: left and right in widths of the lanes, above and below in units of height."""
 POINTS = 9
 """Of a longer chunk so many actions are drawn, evenly spread, with the first and the last."""
