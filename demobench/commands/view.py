@@ -1,6 +1,7 @@
 """`demobench view`: one episode in Rerun, as it was recorded and as every policy would have done; or a recording's file."""
 
 import os
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,8 @@ from rich.console import Console
 from demobench.commands.session import Session, known_target, open_dataset, open_session
 from pipeline.errors import ConfigError, NotApplicableError, did_you_mean
 from pipeline.experiment import Target, parse_list
+
+NEED_FFMPEG = {"h264", "avc1", "h265", "hevc"}
 
 
 def view_episode(
@@ -66,6 +69,12 @@ def view_episode(
     shown, look = [int(position[0])], {"name": f"{target.key} {episode}", "floors": floors, "everyone": names}
     for why in to_rerun.write_rerun(path, demos, semantics, predictions, shown, **look):
         session.console.print(f"Left out: {why}", soft_wrap=True)
+    if not save and _stays_dark(demos):
+        session.console.print(
+            "The camera stays dark: its pictures are H.264 or H.265, which Rerun's window has ffmpeg decode, and there is none on "
+            f"this machine. Install ffmpeg, or look in a browser: rerun --web-viewer --bind 127.0.0.1 {path}",
+            soft_wrap=True,
+        )
     if save:
         session.console.print(f"Written to {save}. Open it with: rerun --bind 127.0.0.1 {save}", soft_wrap=True)
     elif to_rerun.view(path).returncode:
@@ -109,6 +118,12 @@ def is_recording(argument: str) -> bool:
 def has_screen() -> bool:
     """Whether a window can be opened: not on a Linux machine without a display."""
     return not sys.platform.startswith("linux") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+
+
+def _stays_dark(demos: Any) -> bool:
+    """Whether Rerun's own window cannot show a camera here; it says so in small letters, and no remedy."""
+    codecs = {camera.codec for camera in demos.cameras if camera.present}
+    return bool(codecs & NEED_FFMPEG) and shutil.which("ffmpeg") is None
 
 
 def _opened(argument: str, session: Session) -> tuple[Target, Any, Any]:

@@ -43,7 +43,7 @@ def load_scenes(folder: Path) -> Scenes | None:
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise StoreError(
             f"{path} is damaged ({str(error).splitlines()[0]}), so these roll-outs cannot be drawn; their numbers stand in another "
-            f"file. Delete {folder.parent} and the data set's rollout_video, benchmark_report and rerun_recording, and run again: "
+            f"file. Delete {folder.parent} and the data set's rollout_video, benchmark_report and recordings, and run again: "
             "policies are rolled out again, none is trained."
         ) from None
     return scenes
