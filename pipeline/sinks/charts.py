@@ -20,7 +20,7 @@ from pipeline.sinks.drawing import (
     number,
     with_unit,
 )
-from pipeline.sinks.palette import INK, MUTED, dash_of, policy_colours
+from pipeline.sinks.palette import INK, MUTED, policy_colours, policy_dashes
 
 __all__ = [
     "axis_top",
@@ -55,7 +55,8 @@ def error_over_horizon(
         if number(error) is not None
     ]
     names = list(curves)
-    dashes = alt.Scale(domain=names, range=[list(dash_of(name)) for name in names])
+    dash = policy_dashes([*everyone, *names])
+    dashes = alt.Scale(domain=names, range=[list(dash[name]) for name in names])
     picked = alt.selection_point(fields=["policy"], bind="legend")
     legend = alt.Legend(symbolType="stroke", symbolSize=500)
     end = max((row["seconds"] for row in rows), default=1.0) or 1.0

@@ -2,8 +2,9 @@
 
 What belongs here: which colour means what, on light and on dark ground. What does not: drawing.
 
-The hues are those of Okabe & Ito (2008), told apart with any common colour blindness; each is darkened for white
-paper and lightened for dark ground. Baselines are near-grey and dashed, so that colour is left for what was trained.
+The hues are near those of Okabe & Ito (2008), darkened for white paper and lightened for dark ground, and then moved as far
+as it took to tell any two apart without red or green cones too: tests hold them to that. Colours come again after seven
+policies, so every line has a dash beside its colour. Baselines are near-grey, so that colour is left for what was trained.
 """
 
 from collections.abc import Iterable
@@ -31,13 +32,13 @@ SUCCESS = Colour("#0a7cb5", "#58b8ee")
 FAILURE = Colour("#c05502", "#f58b4c")
 
 TRAINED = (
-    Colour("#0072b2", "#4aa8e8"),  # blue
-    Colour("#d55e00", "#f98b45"),  # vermillion
-    Colour("#008a65", "#2fcfa0"),  # bluish green
-    Colour("#b3578f", "#e59ac8"),  # reddish purple
-    Colour("#c28500", "#f2b632"),  # orange
-    Colour("#2f93cf", "#96d6ff"),  # sky blue
-    Colour("#8f8500", "#f0e442"),  # yellow
+    Colour("#006ecd", "#1ea6f1"),  # blue
+    Colour("#e16e04", "#de8148"),  # orange
+    Colour("#0a7d5c", "#2ecf9f"),  # bluish green
+    Colour("#b15a8d", "#e39cca"),  # reddish purple
+    Colour("#ae8e5f", "#eab029"),  # ochre
+    Colour("#2e96cf", "#97d8ff"),  # sky blue
+    Colour("#756203", "#f8ef46"),  # yellow
 )
 ROLES = {
     "ground": GRID,
@@ -61,7 +62,8 @@ DASHES = {
     "constant_velocity": (8, 3, 2, 3),
     "mean_action": (1, 4),
 }
-SOLID = (1, 0)
+ROUNDS = ((1, 0), (11, 3), (5, 2), (9, 2, 2, 2), (3, 3, 9, 3))
+"""Dashes of trained policies: solid for the first seven, another for each seven more."""
 
 
 def is_baseline(policy: str) -> bool:
@@ -72,17 +74,22 @@ def is_baseline(policy: str) -> bool:
 def policy_colours(policies: Iterable[str]) -> dict[str, Colour]:
     """Colour of each policy, by name: equal sets of policies get equal colours whatever their order.
 
-    From the eighth trained policy on, colours come again; legends and tooltips still name each line.
+    From the eighth trained policy on, colours come again, with another dash (`policy_dashes`).
     """
     names = sorted(set(policies))
-    trained = [name for name in names if name not in BASELINES]
-    colours = {name: TRAINED[place % len(TRAINED)] for place, name in enumerate(trained)}
+    colours = {name: TRAINED[place % len(TRAINED)] for place, name in enumerate(_trained(names))}
     return {name: BASELINES[name] if name in BASELINES else colours[name] for name in names}
 
 
-def dash_of(policy: str) -> tuple[int, ...]:
-    """The dash pattern of a policy's line, in pixels on and off."""
-    return DASHES.get(policy, SOLID)
+def policy_dashes(policies: Iterable[str]) -> dict[str, tuple[int, ...]]:
+    """The dash of each policy's line, in pixels on and off: no two of them share both colour and dash."""
+    names = sorted(set(policies))
+    dashes = {name: ROUNDS[place // len(TRAINED) % len(ROUNDS)] for place, name in enumerate(_trained(names))}
+    return {name: DASHES[name] if name in BASELINES else dashes[name] for name in names}
+
+
+def _trained(names: Iterable[str]) -> list[str]:
+    return [name for name in names if name not in BASELINES]
 
 
 def all_colours() -> tuple[Colour, ...]:
