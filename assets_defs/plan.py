@@ -32,7 +32,7 @@ CODE_VERSIONS = {
     "rollouts": "4",
     "scored_predictions": "2",
     "benchmark_table": "8",
-    "benchmark_report": "10",
+    "benchmark_report": "11",
     "rollout_video": "1",
     "mcap_log": "3",
     "rerun_recording": "4",

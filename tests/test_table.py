@@ -141,7 +141,7 @@ def test_a_reader_sees_what_the_numbers_rest_on(table):
         "[bold]tape[/]", "px", "mlp_k01", "state", "42 % 28–57", "—", "5 folds, 6 held out", "2 seeds × 5 steps",
         "protocol strict", "95 % interval: bootstrap-t over held-out episodes and seeds, for these folds", "Clopper–Pearson",
         "floor by radius", "3 comparisons in one family", "no floor of 'state' at the first action: 6 episodes are too few",
-        "against", "The lowest first-step error is that of", "No floor can be given at the first action",
+        "against", "Closest to the demonstrations is", "No floor can be given at the first action",
     ):  # fmt: skip
         assert words in text
     assert "left out" not in text
@@ -276,7 +276,7 @@ def test_names_are_never_markup_in_a_sentence():
     table = make_table(demos, make_semantics(demos))
     table["dataset"]["warnings"] = []
     table["policies"][0]["observations"] = "[red]x[/red]"
-    assert "seeing [red]x[/red]: 4.50 px" in drawn(table, 200)
+    assert "seeing [red]x[/red]: in 2 episodes" in drawn(table, 200)
 
 
 def test_what_a_checkpoint_says_of_its_training_is_never_markup():

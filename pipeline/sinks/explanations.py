@@ -10,6 +10,7 @@ from typing import Any
 
 from pipeline.sinks.findings import (
     NOT_HELD,
+    STEPPED_IN,
     capital,
     deadline_words,
     driven_words,
@@ -19,6 +20,7 @@ from pipeline.sinks.findings import (
     family,
     first_step_gap,
     not_held,
+    stopped_words,
     success_words,
     without_floor,
 )
@@ -54,11 +56,27 @@ def facts(table: Table) -> list[list[str]]:
 
 
 def budget_words(table: Table) -> str:
-    """`quick (5 seeds × 600 steps)`, and policies with a budget of their own after it."""
+    """`quick (5 seeds × 600 steps)`, and how many policies have a budget of their own."""
     budget = table["budget"]
     steps = f"{plural(budget['seeds'], 'seed')} × {plural(budget['steps'], 'step')}"
-    own = "".join(f", {policy} {words}" for policy, words in budget.get("own", {}).items())
-    return (f"{budget['name']} ({steps})" if budget["name"] else steps) + own
+    own = budget.get("own", {})
+    said = f"{budget['name']} ({steps})" if budget["name"] else steps
+    if not own:
+        return said
+    have = f"{len(own)} policies have budgets" if len(own) > 1 else f"{next(iter(own))} has a budget"
+    return f"{said}, {have} of {'their' if len(own) > 1 else 'its'} own: {', '.join(dict.fromkeys(own.values()))}"
+
+
+def own_budgets(table: Table) -> dict[str, str]:
+    """Which policies have a budget of their own, by budget; empty where none has."""
+    named: dict[str, list[str]] = {}
+    for policy, words in table["budget"].get("own", {}).items():
+        named.setdefault(words, []).append(policy)
+    if not named:
+        return {}
+    rest = budget_words({"budget": table["budget"] | {"own": {}}})
+    said = "; ".join(f"{words}: {', '.join(policies)}" for words, policies in named.items())
+    return {"Budgets": f"{said}. All others: {rest}."}
 
 
 def notes(table: Table) -> list[str]:
@@ -78,7 +96,8 @@ def notes(table: Table) -> list[str]:
         )
     if not any(row["rollouts"] or row.get("no_rollouts") for row in table["policies"]):
         found.append("Closed loop: no simulator for this data set.")
-    found += [f"{capital(words)}." for words in (*driven_words(table), *deadline_words(table), *elsewhere_words(table))]
+    driven = (*driven_words(table), *stopped_words(table), *deadline_words(table))
+    found += [f"{capital(words)}." for words in (*driven, *elsewhere_words(table))]
     found += _tested(table)
     if not_held(table):
         found.append(f"{capital(NOT_HELD)}.")
@@ -125,7 +144,7 @@ def _floor_words(radius: Mapping[str, Any]) -> str:
 def numbers(table: Table, history: int) -> dict[str, str]:
     """How each number was made, under the protocol that made it."""
     protocol = _notebook if table["protocol"] == "notebook" else _strict
-    return protocol(table, history) | _common(table)
+    return protocol(table, history) | _common(table) | own_budgets(table)
 
 
 def _strict(table: Table, history: int) -> dict[str, str]:
@@ -234,8 +253,8 @@ def _common(table: Table) -> dict[str, str]:
             "over start states; its interval, like every interval of a score, is by bootstrap-t over start states, with what "
             "seeds vary by. Where all start states give the same, it is what so many that are alike make sure. The score is the "
             "mean over start states of the best reward of the episode, from 0 to 1. The safety layer "
-            "passes on what keeps the robot's limits, whatever a policy asks for; it stops an episode where an action is not "
-            "finite, or as the configuration says."
+            f"passes on what keeps the robot's limits, whatever a policy asks for; where it stepped in, {STEPPED_IN}, by "
+            "so much on average. It stops an episode where an action is not finite, or as the configuration says."
         )
     entries["Cost"] = (
         "Parameters of one network; training seconds of all seeds and folds together; latency of one call, "

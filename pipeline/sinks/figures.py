@@ -13,7 +13,18 @@ import numpy as np
 
 from pipeline.methods import METHODS
 from pipeline.sinks import bracket_chart, charts, curve_chart, planes
-from pipeline.sinks.findings import LOSSES, ahead, bracket_of, capital, floors_of, name_in, not_above, ranks, why_not
+from pipeline.sinks.findings import (
+    LOSSES,
+    MORE,
+    ahead,
+    bracket_of,
+    capital,
+    floors_of,
+    name_in,
+    not_above,
+    ranks,
+    why_not,
+)
 from pipeline.sinks.words import common_unit, show
 from pipeline.statistics.curve import METRIC_WORDS
 from pipeline.statistics.curve_reading import Reading
@@ -36,12 +47,16 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """Pictures that answer one question, and how to read them; those about floors stand beside the floors' table."""
+    """Pictures that answer one question, and how to read them; those about floors stand beside the floors' table.
+
+    answer   what the pictures say, where it belongs to the first screen too
+    """
 
     question: str
     reading: str
     panels: tuple[Panel, ...]
     about: Literal["policies", "floors"] = "policies"
+    answer: str = ""
 
 
 def benchmark_figures(
@@ -91,7 +106,7 @@ def curve_figure(table: Mapping[str, Any], address: str, reading: Reading) -> Fi
         f"{said} {policy} ({observations}) was trained on nested parts of the training episodes and scored on the same held-out "
         "episodes. Thin lines are single orders of the episodes, bars 95 % intervals; dashed, where it is known, the floor."
     )
-    return Figure("Would more demonstrations help?", how, tuple(panels))
+    return Figure(MORE, how, tuple(panels), answer=said)
 
 
 def by_observation_set(table: Mapping[str, Any]) -> dict[str, list[Row]]:

@@ -23,6 +23,7 @@ LOSSES = {"rmse": "RMSE", "mae": "MAE", "l2": "L2"}
 DRIVEN = ("success", "score")
 """What is compared in closed loop."""
 MOST_NAMED, MOST_LEFT_OUT = 5, 12
+STEPPED_IN = f"it changed an action by more than {percent(TOLERANCE)} of a column's range"
 
 
 NOT_HELD = "no policy is held against a floor under protocol notebook: it averages over frames, a floor over episodes"
@@ -34,24 +35,40 @@ class Strong(str):
     __slots__ = ()
 
 
+class Command(str):
+    """A part of a sentence that is to be typed."""
+
+    __slots__ = ()
+
+
 Sentence = list[str]
-"""Parts of a sentence, one after another; some are `Strong`."""
+"""Parts of a sentence, one after another; some are `Strong`, some are a `Command`."""
+BEST, FLOOR, ELSEWHERE, DRIVEN_ALONE, MORE = (
+    "Which policy is best?", "How good can it get?", "What was predicted elsewhere?", "How does it do by itself?",
+    "Would more demonstrations help?",
+)  # fmt: skip
+"""What a reader wants to know, in this order."""
 
 
 def answer(table: Table) -> list[Sentence]:
     """What a reader wants to know first, each with the test or the floor that carries it."""
+    return [sentence for sentences in answers(table).values() for sentence in sentences]
+
+
+def answers(table: Table) -> dict[str, list[Sentence]]:
+    """The same by the question that it answers; questions that the table has no answer to are left out."""
     rows = [row for row in table["policies"] if is_number(row["first_step_mae"]) and ranks(row)]
-    found = []
+    found: dict[str, list[Sentence]] = {}
     if rows:
         best = min(rows, key=lambda row: row["first_step_mae"])
-        found = [_best(table, best), *_second(table, rows, best), *_against_still(table, rows, best)]
-        found += [*_against_champion(table, rows), *_first_step_floor(table, best), *_later_floor(table, best)]
-    found += [_from_elsewhere(table, row) for row in table["policies"] if is_elsewhere(row)]
-    driven = [row for row in table["policies"] if row["rollouts"]]
-    if not driven:
-        return found
-    most = max(driven, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]))
-    return [*found, _best_driven(most), *_driven_verdicts(table, most)]
+        found[BEST] = [_best(table, best), *_second(table, rows, best), *_against_still(table, rows, best)]
+        found[BEST] += _against_champion(table, rows)
+        found[FLOOR] = [*_first_step_floor(table, best), *_later_floor(table, best)]
+    found[ELSEWHERE] = [_from_elsewhere(table, row) for row in table["policies"] if is_elsewhere(row)]
+    if driven := [row for row in table["policies"] if row["rollouts"]]:
+        most = max(driven, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]))
+        found[DRIVEN_ALONE] = [_best_driven(most), *_driven_verdicts(table, most)]
+    return {question: sentences for question, sentences in found.items() if sentences}
 
 
 def excluded_words(table: Table) -> str:
@@ -141,18 +158,17 @@ def elsewhere_words(table: Table) -> list[str]:
 
 
 def driven_words(table: Table) -> list[str]:
-    """What closed-loop results rest on: how chunks were carried out where that is not as usual, what the safety layer did,
-    and why there are none."""
-    found = []
+    """What closed-loop results rest on: how chunks were carried out where that is not as usual, and why there are none."""
+    carried: dict[str, list[str]] = {}
     for row in (row for row in table["policies"] if row["rollouts"]):
         how = row["rollouts"].get("execution")
         if how and Execution(**how) != settled(AS_USUAL, row["chunk"] or 1):
-            found.append(f"roll-outs of {name_in(table, address(row))}: {execution_words(Execution(**how))}")
+            carried.setdefault(execution_words(Execution(**how)), []).append(name_in(table, address(row)))
     reasons: dict[str, list[str]] = {}
     for row in table["policies"]:
         if why := row.get("no_rollouts"):
             reasons.setdefault(why, []).append(name_in(table, address(row)))
-    found += _safety_words(table)
+    found = [f"roll-outs of {', '.join(names)}: {how}" for how, names in carried.items()]
     return found + [f"no roll-outs of {', '.join(names)}: {why}" for why, names in reasons.items()]
 
 
@@ -169,24 +185,33 @@ def deadline_words(table: Table) -> list[str]:
     return found
 
 
-def _safety_words(table: Table) -> list[str]:
+def safety_words(table: Table) -> list[str]:
     """How often the safety layer stepped in and how far, policy by policy; nothing where it did not have to."""
     rows = [row for row in table["policies"] if (row["rollouts"] or {}).get("interventions")]
     if not rows:
         return []
     words = [f"{name_in(table, address(row))} {_stepped_in(row['rollouts'])}" for row in rows]
-    least = percent(TOLERANCE)
-    return [
-        f"the safety layer stepped in (it changed an action by more than {least} of a column's range): {'; '.join(words)}"
-    ]
+    return [f"the safety layer stepped in ({STEPPED_IN}): {'; '.join(words)}"]
+
+
+def stopped_words(table: Table) -> list[str]:
+    """Whose episodes the safety layer stopped; nothing where it stopped none."""
+    rows = [row for row in table["policies"] if (row["rollouts"] or {}).get("stopped")]
+    words = [f"{name_in(table, address(row))} {_stopped(row['rollouts'])}" for row in rows]
+    return [f"the safety layer stopped episodes: {'; '.join(words)}"] if words else []
 
 
 def _stepped_in(rollouts: Mapping[str, Any]) -> str:
-    share, stopped, broken = (rollouts[name] for name in ("intervened", "stopped", "stopped_not_finite"))
     size = rollouts.get("mean_intervention")
+    said = f"in {percent(rollouts['intervened'])} of the frames"
+    said += f", by {percent(size)} on average" if is_number(size) else ""
+    return f"{said} ({_stopped(rollouts)})" if rollouts["stopped"] else said
+
+
+def _stopped(rollouts: Mapping[str, Any]) -> str:
+    broken = rollouts["stopped_not_finite"]
     why = f", {broken} for actions that are not finite" if broken else ""
-    said = f"in {percent(share)} of the frames" + (f", by {percent(size)} on average" if is_number(size) else "")
-    return f"{said} ({stopped} of {rollouts['episodes']} episodes stopped{why})" if stopped else said
+    return f"{rollouts['stopped']} of {rollouts['episodes']} episodes stopped{why}"
 
 
 def _samples_words(scores: Mapping[str, Any], unit: str) -> str:
@@ -228,9 +253,16 @@ def dataset_unit(table: Table) -> str:
 def _best(table: Table, best: Row) -> Sentence:
     interval = show_interval((best.get("interval") or {}).get("first_step_mae"))
     value = Strong(f"{show(best['first_step_mae'])}{dataset_unit(table)}")
-    held_out = sum(len(fold["test"]) for fold in table["split"]["folds"])
-    among = f" of the rows on all {held_out} held-out episodes" if any(map(is_elsewhere, table["policies"])) else ""
-    said = [f"The lowest first-step error{among} is that of ", *who(best), ": ", value, f" {interval}".rstrip(), ". "]
+    held_out = plural(len({episode for fold in table["split"]["folds"] for episode in fold["test"]}), "episode")
+    every = (
+        f"Of the rows on all {held_out} held out, closest" if any(map(is_elsewhere, table["policies"])) else "Closest"
+    )
+    said = [
+        f"{every} to the demonstrations is ",
+        *who(best),
+        f": in {held_out} that it never saw its next action is off by ",
+    ]
+    said += [value, f" on average{f' {interval}' if interval else ''} (first-step MAE). "]
     if best["policy"] == "hold_still":
         return [*said, "So no policy is better than holding still."]
     found = compared(table, address(best), "hold_still")
@@ -292,7 +324,8 @@ def _second(table: Table, rows: Sequence[Row], best: Row) -> list[Sentence]:
     if found := forth or back:
         return [["It ", Strong("cannot be told from the second"), f", {name}: {found['words']}."]]
     both = " ".join(f"{key_of(table)}/{address(row)}" for row in (best, second))
-    return [["Whether it is better than the second, ", name, f", is not tested here; demobench compare {both} tells."]]
+    ask = Command(f"demobench compare {both}")
+    return [["Whether it is better than the second, ", name, ", is not tested here; ", ask, " tells."]]
 
 
 def _best_driven(most: Row) -> Sentence:
@@ -324,6 +357,9 @@ def _driven_verdicts(table: Table, most: Row) -> list[Sentence]:
         return []
     success, score = (_driven_groups(table, [c for c in comparisons if c["metric"] == metric]) for metric in DRIVEN)
     said = f"success and score: {success}" if success == score else f"success: {success}. Score: {score}"
+    said = (
+        said if most["rollouts"]["success"] else f"score: {score}"
+    )  # where nobody succeeds there is nothing to tell apart
     named = Strong(name_in(table, found["reference"]))
     if found["chosen"] == "champion":
         return [["In closed loop, against the champion ", named, f" – {said}."]]
@@ -507,9 +543,9 @@ def _first_step_span(table: Table, best: Row) -> Sentence | None:
     span = f"{show(floor['value'], places)} and {show(floor['upper'], places)}{dataset_unit(table)}"
     interval = show_interval(floor["interval"], places)
     there = (
-        "it is above, so there is room for a better policy"
+        f"{best['policy']} is above, so there is room for a better one"
         if best["first_step_mae"] > floor["interval"][1]
-        else "it may be there already"
+        else f"{best['policy']} may be there already"
     )
     sees = f" {interval} for policies seeing {best['observations']}: {there}."
     return ["At the first action the floor of the MAE lies between ", Strong(span), sees]

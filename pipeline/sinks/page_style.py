@@ -55,7 +55,7 @@ STYLE = """
 :root {
   color-scheme: light dark;
   --ink: var(INK); --muted: var(MUTED); --line: var(GRID); --page: var(PAGE);
-  --soft: color-mix(in srgb, var(INK) 4%, var(PAGE));
+  --soft: color-mix(in srgb, var(INK) 4%, var(PAGE)); --edge: color-mix(in srgb, var(INK) 28%, transparent);
 }
 * { box-sizing: border-box; }
 body {
@@ -67,21 +67,37 @@ h1 { margin: 2px 0 10px; font-size: 34px; line-height: 1.15; letter-spacing: -.0
 h2 { margin: 0 0 6px; font-size: 20px; line-height: 1.3; letter-spacing: -.005em; }
 h3 { margin: 24px 0 4px; font-size: 16px; }
 section { margin-top: 44px; }
-section > p, .short { max-width: 78ch; }
 .brand { margin: 0; color: var(--muted); font-size: 13px; letter-spacing: .08em; text-transform: uppercase; }
 .facts { margin: 2px 0; color: var(--muted); font-size: 14px; }
 .facts span { display: inline-block; }
-.short { margin: 26px 0 -18px; font-size: 18px; }
-.short p { margin: 0; }
-.short ul { margin: 10px 0 0; padding-left: 20px; font-size: 16px; }
-.short li { margin: 3px 0; }
+section > p { max-width: 78ch; }
+.short { margin: 26px 0 -14px; }
+.short > p { max-width: 72ch; margin: 0; font-size: 20px; line-height: 1.45; }
+.short dl { display: block; margin: 14px 0 0; font-size: 15.5px; }
+.short dl > div {
+  display: grid; gap: 2px 28px; grid-template-columns: 15.5em minmax(0, 78ch); padding: 9px 0;
+  border-top: 1px solid var(--line);
+}
+.short dt small { display: block; color: var(--muted); font-size: 13px; font-weight: 400; line-height: 1.35; }
+.short dd { color: inherit; }
+.short dd p { margin: 0 0 3px; }
+.short code { font-size: .88em; overflow-wrap: anywhere; }
 .verdict { white-space: nowrap; }
 .verdict.better { color: var(SUCCESS); }
 .verdict.worse { color: var(FAILURE); }
 .words th, .words td { text-align: left; }
 .words .wraps { min-width: 30ch; max-width: 62ch; white-space: normal; }
 
-.scroll { overflow-x: auto; border-block: 1px solid var(--line); }
+/* Where a table goes on beyond an edge, a shadow lies on that edge: the first two grounds move along and cover it. */
+.scroll {
+  overflow-x: auto; border-block: 1px solid var(--line);
+  background:
+    linear-gradient(90deg, var(--page) 30%, transparent) 0 0 / 48px 100% no-repeat local,
+    linear-gradient(270deg, var(--page) 30%, transparent) 100% 0 / 48px 100% no-repeat local,
+    linear-gradient(90deg, var(--edge), transparent) 0 0 / 16px 100% no-repeat scroll,
+    linear-gradient(270deg, var(--edge), transparent) 100% 0 / 16px 100% no-repeat scroll;
+}
+.sideways { display: none; }
 .scroll:focus-visible, summary:focus-visible { outline: 2px solid var(--ink); outline-offset: 2px; }
 table {
   width: 100%; border-collapse: separate; border-spacing: 0; font-size: 13.5px; font-variant-numeric: tabular-nums;
@@ -103,7 +119,7 @@ td.best, td.best b { font-weight: 700; }
 td.none { color: var(--muted); }
 .left, .name { text-align: left; }
 .name { position: sticky; left: 0; z-index: 1; background: var(--page); }
-tbody th.name small { display: none; padding-left: 19px; }
+tbody th.name small { padding-left: 19px; }
 tbody tr:hover > * { background: var(--soft); }
 tr.baseline .name, tr.baseline td { color: var(--muted); }
 .swatch {
@@ -111,7 +127,7 @@ tr.baseline .name, tr.baseline td { color: var(--muted); }
 }
 tr.baseline .swatch { border-radius: 50%; }
 .range {
-  display: block; position: relative; width: 138px; height: 9px; margin: 3px 0 1px auto;
+  display: block; position: relative; width: 118px; height: 9px; margin: 3px 0 1px auto;
   border-left: 1px solid var(--line);
   background: linear-gradient(var(--line), var(--line)) 0 4px / 100% 1px no-repeat;
 }
@@ -122,7 +138,10 @@ tr.baseline .swatch { border-radius: 50%; }
 .notes { max-width: 96ch; margin: 12px 0 18px; padding-left: 20px; color: var(--muted); font-size: 14px; }
 details { margin-top: 14px; }
 details .scroll { margin-top: 8px; }
-summary { padding: 4px 0; font-size: 15px; cursor: pointer; }
+summary {
+  width: fit-content; padding: 6px 14px; border: 1px solid var(--line); border-radius: 6px; background: var(--soft);
+  font-size: 15px; cursor: pointer;
+}
 aside { margin-top: 36px; padding: 14px 20px; border-left: 3px solid var(FAILURE); background: var(--soft); }
 aside h2 { font-size: 16px; }
 aside ul { margin: 6px 0; padding-left: 20px; font-size: 15px; overflow-wrap: anywhere; }
@@ -165,6 +184,9 @@ pre {
 }
 code { font: 14px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace; }
 
+@media screen and (max-width: 1180px) {
+  .sideways { display: inline; }
+}
 @media (max-width: 900px) {
   .figures { display: block; }
   .figures section { margin-top: 40px; }
@@ -173,12 +195,11 @@ code { font: 14px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu San
   main { padding: 22px 16px 48px; }
   h1 { font-size: 27px; }
   h2 { font-size: 18px; }
-  .short { font-size: 16px; }
   .scroll { margin-inline: -16px; }
   th, td { padding: 7px 8px; }
   .name { padding-left: 16px; box-shadow: 1px 0 0 var(--line); }
-  .left { display: none; }
-  tbody th.name small { display: block; }
+  .short > p { font-size: 18px; }
+  .short dl > div { grid-template-columns: minmax(0, 1fr); }
   .range { width: 104px; }
   .words { margin-inline: 0; }
   .words thead { display: none; }

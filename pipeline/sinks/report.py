@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.sinks import explanations, replacing
-from pipeline.sinks.findings import Strong, answer
+from pipeline.sinks.findings import BEST, FLOOR, MORE, Command, Sentence, Strong, answers, key_of
 from pipeline.sinks.markup import Html, element, join, json_for_script, script_text
 from pipeline.sinks.page_style import draw_script, style_sheet, themed
 from pipeline.sinks.report_sections import (
@@ -97,7 +97,9 @@ def render_report(table: Table, figures: Sequence["Figure"], provenance: Provena
         element("script", bundle),
         element("script", draw),
     ]
-    body = element("body", element("main", _body(table, _sections(figures, specs), provenance, videos)), scripts)
+    body = element(
+        "body", element("main", _body(table, figures, _sections(figures, specs), provenance, videos)), scripts
+    )
     return f"<!doctype html>\n{element('html', element('head', head), body, lang='en')}\n"
 
 
@@ -121,13 +123,17 @@ def _policy(*scripts: str, videos: bool) -> str:
 
 
 def _body(
-    table: Table, sections: Mapping[str, list[Html]], provenance: Provenance, videos: Html | None
+    table: Table,
+    figures: Sequence["Figure"],
+    sections: Mapping[str, list[Html]],
+    provenance: Provenance,
+    videos: Html | None,
 ) -> list[Html | None]:
     return [
         element(
             "header", element("p", "demobench", class_="brand"), element("h1", table["dataset"]["name"]), _facts(table)
         ),
-        _in_short(table),
+        _in_short(table, figures),
         element("section", benchmark_table(table), _notes(table), column_table(table)),
         _warnings(provenance.warnings),
         element("noscript", element("p", "The pictures below need JavaScript; nothing is loaded from anywhere.")),
@@ -157,16 +163,40 @@ def _dotted(parts: Sequence[str]) -> list[Html]:
     return [piece for span in spans for piece in (Html(" · "), span)][1:]
 
 
-def _in_short(table: Table) -> Html | None:
-    """The answer before the table: one sentence large, what else is known below it."""
-    first, *others = [[_part(part) for part in sentence] for sentence in answer(table)] or [None]
-    if first is None:
+HINTS = {
+    FLOOR: "The floor: the least error of any policy that gives one answer to what it sees.",
+    BEST: "Hold-still stays where it is: what a policy must beat.",
+}
+"""What a question's words mean, for those who read them for the first time."""
+
+
+def _in_short(table: Table, figures: Sequence["Figure"]) -> Html | None:
+    """The answer before the table: one sentence large, what else is known by the question that it answers."""
+    found = answers(table)
+    if not found:
         return None
-    more = element("ul", [element("li", sentence) for sentence in others]) if others else None
-    return element("div", element("p", first), more, class_="short")
+    found |= {MORE: [[figure.answer] for figure in figures if figure.answer] or _not_asked(table)}
+    question = next(iter(found))
+    first, *found[question] = found[question]
+    rows = [_question(question, sentences) for question, sentences in found.items() if sentences]
+    return element("div", element("p", [_part(part) for part in first]), element("dl", rows), class_="short")
+
+
+def _question(question: str, sentences: Sequence[Sentence]) -> Html:
+    hint = element("small", HINTS[question]) if question in HINTS else None
+    said = element("dd", [element("p", [_part(part) for part in sentence]) for sentence in sentences])
+    return element("div", element("dt", question, hint), said)
+
+
+def _not_asked(table: Table) -> list[Sentence]:
+    return [
+        ["Not asked yet: ", Command(f"demobench curve {key_of(table)}"), " trains on ever fewer of them, and tells."]
+    ]
 
 
 def _part(part: str) -> Html | str:
+    if isinstance(part, Command):
+        return element("code", part)
     return element("b", part) if isinstance(part, Strong) else part
 
 

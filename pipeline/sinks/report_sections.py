@@ -97,7 +97,7 @@ def modes_section(table: Table) -> Html | None:
         [
             Cell(capital(ahead(one["horizon"], fps))),
             Cell(one["observations"]),
-            Cell(one["words"] or f"Not looked for: {one['refused']}", wraps=True),
+            Cell(_modes_words(one), wraps=True),
         ]
         for one in table["modes"]
     ]
@@ -108,6 +108,12 @@ def modes_section(table: Table) -> Html | None:
         element("p", said),
         _table(caption, heads, rows, f"All {len(rows)} answers"),
     )
+
+
+def _modes_words(one: Mapping[str, Any]) -> str:
+    """The answer without where and when, which stand in cells of their own."""
+    at = f"With '{one['observations']}' at horizon {one['horizon']} "
+    return capital(one["words"].removeprefix(at)) if one["words"] else f"Not looked for: {one['refused']}"
 
 
 def _floor_row(table: Table, floor: Mapping[str, Any]) -> list[Cell]:
@@ -144,6 +150,11 @@ def sensor_section(table: Table) -> Html | None:
     sensors = table["sensors"]
     if not sensors:
         return None
+    title = element("h2", "What is each sensor worth?")
+    if not any(is_number(sensor["value"]) or is_number(sensor["at_least"]) for sensor in sensors):
+        pairs = ", ".join(dict.fromkeys(f"{s['smaller']} to {s['larger']}" for s in sensors))
+        why = "no floor could be given that would show how far it falls; the reasons are in the table above."
+        return element("section", title, element("p", f"Not known for {pairs}: {why}"))
     horizons = sorted({sensor["horizon"] for sensor in sensors})
     found = {(s["smaller"], s["larger"], s["horizon"]): s for s in sensors}
     pairs = list(dict.fromkeys((s["smaller"], s["larger"]) for s in sensors))
@@ -165,7 +176,7 @@ def sensor_section(table: Table) -> Html | None:
     )
     return element(
         "section",
-        element("h2", "What is each sensor worth?"),
+        title,
         element("p", said),
         _table("Fall of the floor, with 95 % intervals.", heads, rows, "What each sensor is worth"),
     )

@@ -15,6 +15,8 @@ from pipeline.sinks.report_sections import verdict
 from pipeline.sinks.words import DASH, common_unit, decimals_for, is_number, percent, show, show_interval
 
 Row = Mapping[str, Any]
+SIDEWAYS = element("span", "This table scrolls sideways.", class_="sideways")
+"""Shown where a screen is too narrow for the table."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ def benchmark_table(table: Mapping[str, Any]) -> Html:
     """The table of one object of `run --json`; closed-loop columns only where something was rolled out."""
     rows = table["policies"]
     columns = _columns(table)
-    heads = [_head("Policy", "", class_="name"), _head("Observations", "", class_="left")]
+    heads = [_head("Policy", "and what it sees", class_="name")]
     heads += [_head(column.title, column.below) for column in columns]
     decimals = [
         decimals_for([column.value(row) for row in rows]) if column.decimals is None else column.decimals
@@ -42,11 +44,11 @@ def benchmark_table(table: Mapping[str, Any]) -> Html:
     bests = [_best(column, rows) for column in columns]
     body = []
     for row in rows:
-        cells = [_name_cell(row), element("td", row["observations"], class_="left")]
+        cells = [_name_cell(row)]
         for column, places, best in zip(columns, decimals, bests, strict=True):
             cells.append(_cell(column, row, places, best))
         body.append(element("tr", cells, class_="baseline" if is_baseline(row["policy"]) else None))
-    caption = "Policies, lowest first-step error on top. Bold: the best value of its column."
+    caption = ["Policies, lowest first-step error on top. Bold: the best value of its column. ", SIDEWAYS]
     inner = element(
         "table", element("caption", caption), element("thead", element("tr", heads)), element("tbody", body)
     )
@@ -54,7 +56,7 @@ def benchmark_table(table: Mapping[str, Any]) -> Html:
 
 
 def _name_cell(row: Row) -> Html:
-    """A policy with its colour; narrow screens show the observation set here and hide that column."""
+    """A policy with its colour, and below it the observation set that it sees."""
     swatch = element("span", class_="swatch", data_policy=row["policy"], aria_hidden="true")
     name = f"{row['policy']} (seen in training)" if is_seen(row) else row["policy"]
     return element("th", swatch, name, element("small", row["observations"]), class_="name", scope="row")
@@ -96,8 +98,7 @@ def _columns(table: Mapping[str, Any]) -> list[Column]:
         ]
     return [
         *columns,
-        Column("Params", "one net", lambda row: row["params"], None, lambda row, _: _count(row["params"])),
-        Column("Training", "s", lambda row: row["train_s"], None, lambda row, _: _seconds(row["train_s"])),
+        Column("Params", "one net, training", lambda row: row["params"], None, _network),
         Column("Latency", "ms a call", lambda row: row["latency_ms"], None, _late, 3),
     ]
 
@@ -232,12 +233,11 @@ def _late(row: Row, shown: str) -> Html | str:
     return join(shown, element("small", f"99 %: {show(late)}"), missed)
 
 
-def _count(value: float) -> str:
-    return f"{value:,}" if value else DASH
-
-
-def _seconds(value: float) -> str:
-    return (f"{value:,.0f}" if value >= 10 else f"{value:.1f}") if value else DASH
+def _network(row: Row, _: str) -> Html:
+    """Parameters of one network, and below them the seconds that training took."""
+    seconds = row["train_s"]
+    took = f"{seconds:,.0f} s" if seconds and seconds >= 10 else f"{seconds:.1f} s" if seconds else ""
+    return join(f"{row['params']:,}" if row["params"] else DASH, element("small", took) if took else None)
 
 
 def column_table(table: Mapping[str, Any]) -> Html | None:
@@ -246,15 +246,14 @@ def column_table(table: Mapping[str, Any]) -> Html | None:
     names, units = data["action_names"], data["action_units"]
     if len(names) < 2:
         return None
-    heads = [_head("Policy", "", class_="name"), _head("Observations", "", class_="left")]
+    heads = [_head("Policy", "and what it sees", class_="name")]
     heads += [_head(name, unit or "") for name, unit in zip(names, units, strict=True)]
     decimals = [decimals_for([row["error_by_joint"].get(name) for row in rows]) for name in names]
     body = []
     for row in rows:
         errors = [show(row["error_by_joint"].get(name), places) for name, places in zip(names, decimals, strict=True)]
-        cells = [_name_cell(row), element("td", row["observations"], class_="left")]
-        cells += [element("td", error) for error in errors]
-        body.append(element("tr", cells))
-    inner = element("table", element("thead", element("tr", heads)), element("tbody", body))
+        body.append(element("tr", _name_cell(row), [element("td", error) for error in errors]))
+    caption = element("caption", "In each column's own unit. ", SIDEWAYS)
+    inner = element("table", caption, element("thead", element("tr", heads)), element("tbody", body))
     scroll = element("div", inner, class_="scroll", tabindex="0", role="region", aria_label="Error by action column")
     return element("details", element("summary", "First-step MAE of each action column"), scroll)

@@ -27,6 +27,7 @@ from pipeline.sinks.findings import (
     is_elsewhere,
     is_seen,
     not_held,
+    safety_words,
     success_words,
     without_floor,
 )
@@ -287,7 +288,7 @@ def _footnotes(table: Mapping[str, Any]) -> list[str]:
         lines.append(f"success: {words} · score: mean best reward")
     if words := driven_family_words(table):
         lines.append(f"closed loop: {words}")
-    lines += [*driven_words(table), *deadline_words(table)]
+    lines += [*safety_words(table), *driven_words(table), *deadline_words(table)]
     if any(first_step_gap(row) for row in table["policies"]):
         lines.append(
             "above floor: the first action's RMSE less the least that a policy of what it sees can have (gamma); "

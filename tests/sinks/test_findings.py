@@ -3,9 +3,11 @@
 import pytest
 
 from pipeline.sinks.findings import (
+    Command,
     Strong,
     ahead,
     answer,
+    answers,
     champion,
     deadline_words,
     driven_family_words,
@@ -17,6 +19,8 @@ from pipeline.sinks.findings import (
     interval_words,
     limit_words,
     name_in,
+    safety_words,
+    stopped_words,
     success_words,
     without_floor,
 )
@@ -40,14 +44,32 @@ def said(table) -> list[str]:
 
 def test_the_answer_of_a_benchmark(table):
     assert said(table) == [
-        "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]. It is better than hold-still, whose "
-        "error is 4.44 times as large.",
+        "Closest to the demonstrations is mlp_k01 seeing state: in 2 episodes that it never saw its next action is off by 4.50 px "
+        "on average [4.05, 4.95] (first-step MAE). It is better than hold-still, whose error is 4.44 times as large.",
         "Whether it is better than the second, mlp_k04, is not tested here; demobench compare small/mlp_k01/state "
         "small/mlp_k04/state tells.",
         "It is 1.62 px RMSE above the floor [1.25, 2.00]: for policies seeing state that is 4.00 px RMSE at the first action.",
         "In closed loop mlp_k04 seeing state succeeds most often: 41 of 50 (69–91 %).",
     ]
     assert Strong("better than hold-still") in answer(table)[0]
+    assert Command("demobench compare small/mlp_k01/state small/mlp_k04/state") in answer(table)[1]
+
+
+def test_answers_stand_under_the_questions_that_they_answer(table):
+    assert {question: len(sentences) for question, sentences in answers(table).items()} == {
+        "Which policy is best?": 2, "How good can it get?": 1, "How does it do by itself?": 1,
+    }  # fmt: skip
+    table |= {"policies": table["policies"][:1], "brackets": []}
+    table["policies"][0] |= {"above_floor": [], "first_step_mae": None}
+    assert answers(table) == {}
+
+
+def test_where_nobody_succeeds_only_scores_are_compared(table):
+    table["policies"][0]["rollouts"] = table["policies"][1]["rollouts"] | {"success": 0.0, "score": 0.1}
+    table["closed_loop"] = make_closed_loop(*make_driven("mlp_k01/state", "mlp_k04/state", "cannot tell", "worse"))
+    assert said(table)[-1].startswith("Against it in closed loop – success: cannot tell: mlp_k01")
+    table["policies"][1]["rollouts"]["success"] = 0.0
+    assert said(table)[-1] == "Against it in closed loop – score: worse: mlp_k01."
 
 
 @pytest.mark.parametrize("success", [0.06, 0.0])
@@ -64,12 +86,14 @@ def test_how_chunks_were_carried_out_is_said_where_it_is_not_as_usual(table):
     assert driven_words(table) == []
     rolled["execution"] = {"execute": 2, "ensemble": False, "delay": 1}
     assert driven_words(table) == ["roll-outs of mlp_k04: 2 actions of each chunk, 1 frame late"]
+    table["policies"][0]["rollouts"] = rolled
+    assert driven_words(table) == ["roll-outs of mlp_k01, mlp_k04: 2 actions of each chunk, 1 frame late"]
 
 
 def test_what_the_safety_layer_did_and_why_there_are_no_roll_outs_is_said(table):
     rolled = next(row for row in table["policies"] if row["rollouts"])["rollouts"]
     rolled |= {"interventions": 0, "intervened": 0.0, "stopped": 0, "stopped_not_finite": 0}
-    assert driven_words(table) == []
+    assert driven_words(table) == safety_words(table) == stopped_words(table) == []
     rolled |= {
         "interventions": 30,
         "intervened": 0.0123,
@@ -78,11 +102,13 @@ def test_what_the_safety_layer_did_and_why_there_are_no_roll_outs_is_said(table)
         "stopped_not_finite": 3,
     }
     table["policies"][0]["no_rollouts"] = "it does not fit"
-    assert driven_words(table) == [
+    stopped = "4 of 50 episodes stopped, 3 for actions that are not finite"
+    assert safety_words(table) == [
         "the safety layer stepped in (it changed an action by more than 1 % of a column's range): mlp_k04 in 1.2 % of the frames, "
-        "by 3.5 % on average (4 of 50 episodes stopped, 3 for actions that are not finite)",
-        "no roll-outs of mlp_k01: it does not fit",
+        f"by 3.5 % on average ({stopped})",
     ]
+    assert stopped_words(table) == [f"the safety layer stopped episodes: mlp_k04 {stopped}"]
+    assert driven_words(table) == ["no roll-outs of mlp_k01: it does not fit"]
 
 
 @pytest.mark.parametrize(
@@ -104,7 +130,7 @@ def test_nothing_is_called_better_without_a_test(table):
     for row in table["policies"]:
         row["verdict"] = make_verdict()
     first = said(table)[0]
-    assert first == "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]. "
+    assert first.endswith("its next action is off by 4.50 px on average [4.05, 4.95] (first-step MAE). ")
 
 
 @pytest.mark.parametrize(
@@ -178,7 +204,7 @@ def test_hold_still_can_be_the_champion(table):
 
 @pytest.mark.parametrize(
     ("interval", "there"),
-    [([1.9, 3.6], "it is above, so there is room for a better policy"), ([1.9, 4.6], "it may be there already")],
+    [([1.9, 3.6], "mlp_k01 is above, so there is room for a better one"), ([1.9, 4.6], "mlp_k01 may be there already")],
 )
 def test_where_squared_errors_have_no_floor_the_absolute_ones_are_asked(table, interval, there):
     for row in table["policies"]:

@@ -52,10 +52,8 @@ def scripts_of(page: str) -> list[tuple[str, str]]:
 
 def test_the_table_comes_first_and_holds_the_numbers(table, figures):
     page = text_of(render_report(table, figures, PROVENANCE))
-    assert (
-        "mlp_k01 state state 4.50 [4.05, 4.95] 4.44 ✓ better 5.62 1.62 [1.25, 2.00] – – 0.0450 – – 275,462 12" in page
-    )
-    assert "mlp_k04 state state 5.50 [4.95, 6.05] 3.64 ✓ better 6.88 – – – 0.0550 41/50 69–91 % 0.934" in page
+    assert "mlp_k01 state 4.50 [4.05, 4.95] 4.44 ✓ better 5.62 1.62 [1.25, 2.00] – – 0.0450 – – 275,462 12 s" in page
+    assert "mlp_k04 state 5.50 [4.95, 6.05] 3.64 ✓ better 6.88 – – – 0.0550 41/50 69–91 % 0.934" in page
     assert page.index("275,462") < page.index("How fast does the error grow")
     heads = "First-step MAE px, 95 % interval × hold-still ratio, tested RMSE px Above floor RMSE, px At 1 s MAE, px"
     assert heads in page
@@ -74,17 +72,41 @@ def test_budget_protocol_seeds_folds_and_hashes_are_said(table, figures):
 
 def test_the_answer_is_in_a_sentence(table, figures):
     page = text_of(render_report(table, figures, PROVENANCE))
-    said = "The lowest first-step error is that of mlp_k01 seeing state: 4.50 px [4.05, 4.95]. It is better than hold-still ,"
+    said = "its next action is off by 4.50 px on average [4.05, 4.95] (first-step MAE). It is better than hold-still ,"
+    assert "Closest to the demonstrations is mlp_k01 seeing state: in 2 episodes that it never saw" in page
     assert f"{said} whose error is 4.44 times as large." in page
     assert page.index(said) < page.index("× hold-still")
     assert "It is 1.62 px RMSE above the floor [1.25, 2.00]" in page
     assert "mlp_k04 seeing state succeeds most often: 41 of 50 (69–91 %)." in page
 
 
+def test_what_was_not_asked_is_said_with_the_command_that_asks(table, figures):
+    page = render_report(table, figures, PROVENANCE)
+    assert "Would more demonstrations help? Not asked yet: demobench curve small trains on ever fewer" in text_of(page)
+    assert "<code>demobench curve small</code>" in page
+    answered = replace(figures[0], answer="50 more would help.")
+    assert "Would more demonstrations help? 50 more would help." in text_of(
+        render_report(table, [answered, *figures], PROVENANCE)
+    )
+
+
+def test_many_budgets_are_counted_above_and_listed_below(table, figures):
+    table["budget"]["own"] = {f"base_k{k:02d}": "60 CPU-seconds" for k in range(12)} | {"act_k16": "900 steps"}
+    page = text_of(render_report(table, figures, PROVENANCE))
+    assert (
+        "quick (2 seeds × 600 steps), 13 policies have budgets of their own: 60 CPU-seconds, 900 steps · 1 fold" in page
+    )
+    assert "Budgets 60 CPU-seconds: base_k00, base_k01," in page
+    assert "; 900 steps: act_k16. All others: quick (2 seeds × 600 steps)." in page
+    table["budget"]["own"] = {"act_k16": "900 steps"}
+    page = text_of(render_report(table, figures, PROVENANCE))
+    assert "act_k16 has a budget of its own: 900 steps · 1 fold" in page
+
+
 def test_the_sentence_names_no_observations_where_they_do_not_matter(table, figures):
     table["policies"][-1]["first_step_mae"] = 1.0
     page = text_of(render_report(table, figures, PROVENANCE))
-    assert "The lowest first-step error is that of hold_still : 1.00 px" in page
+    assert "Closest to the demonstrations is hold_still : in 2 episodes that it never saw its next action" in page
     assert "So no policy is better than holding still." in page
 
 
@@ -149,13 +171,14 @@ def test_an_empty_distance_to_the_floor_is_explained(demos, table, figures):
 
 def test_errors_of_each_action_column_are_there(table, figures):
     page = text_of(render_report(table, figures, PROVENANCE))
-    assert "First-step MAE of each action column Policy Observations x px y px mlp_k01 state state 4.50 5.50" in page
+    assert "First-step MAE of each action column In each column's own unit. This table scrolls sideways." in page
+    assert "Policy and what it sees x px y px mlp_k01 state 4.50 5.50" in page
 
 
 def test_missing_numbers_are_dashes_and_the_page_is_still_json(table, figures):
     table["policies"][0] |= {"first_step_mae": None, "error_by_horizon": [None], "scaled": None, "latency_ms": None}
     page = render_report(table, figures, PROVENANCE)
-    assert "mlp_k01 state state – 4.44 ✓ better 5.62 1.62 [1.25, 2.00] – – – – – 275,462 12 –" in text_of(page)
+    assert "mlp_k01 state – 4.44 ✓ better 5.62 1.62 [1.25, 2.00] – – – – – 275,462 12 s –" in text_of(page)
     json.loads(scripts_of(page)[0][1])
 
 

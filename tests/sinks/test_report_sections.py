@@ -10,6 +10,7 @@ from pipeline.sinks.report_sections import (
     closed_loop_section,
     comparison_section,
     floor_section,
+    modes_section,
     sensor_section,
     verdict,
 )  # fmt: skip
@@ -68,7 +69,6 @@ def test_nothing_measured_no_section(table):
         ({}, "1.50 [1.00, 2.00], 38 % of the floor"),
         ({"value": 0.1, "interval": [-1.0, 1.2]}, "no fall seen 0.100 [-1.00, 1.20]"),
         ({"value": None, "interval": None, "at_least": 3.0}, "at least 3.00"),
-        ({"value": None, "interval": None}, "not known"),
     ],
 )
 def test_what_a_sensor_is_worth(table, more, expected):
@@ -76,6 +76,29 @@ def test_what_a_sensor_is_worth(table, more, expected):
     table["floor"]["estimates"].append(make_floor(observations="pose", history=1))
     text = words_of(sensor_section(table))
     assert text.endswith(f"From what is seen, to more First action state 3 frames → pose 1 frame {expected}")
+
+
+def test_where_nothing_is_known_of_any_sensor_there_is_a_sentence_and_no_table(table):
+    unknown = {"value": None, "interval": None}
+    table["sensors"] = [make_sensor(**unknown), make_sensor(**unknown, horizon=10)]
+    section = sensor_section(table)
+    assert "<table" not in section
+    assert "Not known for state to pose: no floor could be given" in words_of(section)
+    table["sensors"] = [make_sensor(**unknown), make_sensor(horizon=10)]
+    assert "not known 1.50" in words_of(sensor_section(table))
+
+
+def test_modes_say_where_and_when_once(table):
+    answer = {
+        "observations": "state",
+        "horizon": 0,
+        "words": "With 'state' at horizon 0 there is no evidence.",
+        "refused": None,
+    }
+    table["modes"] = [answer, answer | {"horizon": 10, "words": None, "refused": "too few episodes"}]
+    text = words_of(modes_section(table))
+    assert "First action state There is no evidence." in text
+    assert text.endswith("One second ahead state Not looked for: too few episodes")
 
 
 def test_pairs_of_sets_have_one_line_for_all_horizons(table):
