@@ -12,7 +12,7 @@ import altair as alt
 import numpy as np
 
 from pipeline.methods import METHODS
-from pipeline.sinks import bracket_chart, charts, curve_chart, planes
+from pipeline.sinks import bracket_chart, charts, curve_chart, held_out_chart, planes
 from pipeline.sinks.findings import (
     LOSSES,
     MORE,
@@ -25,6 +25,7 @@ from pipeline.sinks.findings import (
     ranks,
     why_not,
 )
+from pipeline.sinks.held_out import held_out_lines
 from pipeline.sinks.words import common_unit, show
 from pipeline.statistics.curve import METRIC_WORDS
 from pipeline.statistics.curve_reading import Reading
@@ -32,6 +33,8 @@ from pipeline.types import ACTION, STATE, Demonstrations, Predictions, RadiusFlo
 
 POINTS = 400
 """Points in a scatter, at most; evenly spaced among all."""
+DRIVES = 60
+"""Roll-outs in one picture, at most; evenly spaced among all."""
 COLUMNS = 6
 EPISODES = 3
 Row = Mapping[str, Any]
@@ -81,10 +84,9 @@ def benchmark_figures(
     figures += [horizon_figure(table), chunk_figure(table)]
     best = best_predictions(table, predictions)
     if best is not None:
-        in_plane = _in_a_plane(semantics, demos)
-        figures.append(
-            (paths_figure if in_plane else joints_figure)(demos, semantics, _longest(predictions, best), everyone)
-        )
+        figures.append(held_out_figure(table, demos, semantics, predictions))
+        if _in_a_plane(semantics, demos):
+            figures.append(paths_figure(demos, _longest(predictions, best), everyone))
         figures.append(scatter_figure(demos, semantics, best, everyone))
     figures += [rollout_figure(rollouts, demos), floor_figure(demos, semantics, floors), lag_figure(table)]
     return [figure for figure in figures if figure is not None]
@@ -242,7 +244,7 @@ def _shown_episodes(demos: Demonstrations, one: Predictions) -> list[int]:
     ]
 
 
-def paths_figure(demos: Demonstrations, semantics: Semantics, one: Predictions, everyone: Sequence[str]) -> Figure:
+def paths_figure(demos: Demonstrations, one: Predictions, everyone: Sequence[str]) -> Figure:
     """Actions that are positions in a plane: the recorded path, and chunks predicted along it."""
     feature, chunk = demos.features[ACTION], one.actions.shape[2]
     panels = []
@@ -271,37 +273,20 @@ def paths_figure(demos: Demonstrations, semantics: Semantics, one: Predictions, 
     return Figure("What would the policy have done in demonstrations that it never saw?", reading, tuple(panels))
 
 
-def joints_figure(demos: Demonstrations, semantics: Semantics, one: Predictions, everyone: Sequence[str]) -> Figure:
-    """Joints over time in one held-out episode: recorded action, state, the policy's first action at every frame."""
-    feature = demos.features[ACTION]
-    episode = _shown_episodes(demos, one)[0]
-    frames = demos.episode(episode)
-    inside = one.in_frames(frames)
-    places = one.anchors[inside] - frames.start
-    every = slice(None, None, max(1, len(demos.timestamps[frames]) // POINTS))
-    panels = []
-    for column in range(min(len(feature.names), COLUMNS)):
-        predicted = np.full(frames.stop - frames.start, np.nan)
-        predicted[places] = one.actions[0, inside, 0, column]
-        series = {"recorded": demos.columns[ACTION][frames, column], one.policy: predicted}
-        where = semantics.state_column[column]
-        if semantics.kinds[column] == "position" and where is not None:
-            series = {"state": demos.columns[STATE][frames, where]} | series
-        chart = charts.columns_over_time(
-            demos.timestamps[frames][every],
-            {what: values[every] for what, values in series.items()},
-            unit=feature.units[column],
-            name=feature.names[column],
-            everyone=everyone,
-        )
-        panels.append(Panel(feature.names[column], chart))
+def held_out_figure(
+    table: Mapping[str, Any], demos: Demonstrations, semantics: Semantics, predictions: Sequence[Predictions]
+) -> Figure | None:
+    """Any held-out episode, action column and horizon, as the reader chooses."""
+    lines = held_out_lines(table, demos, semantics, predictions)
+    if lines is None:
+        return None
+    chart = held_out_chart.held_out_chart(lines, everyone=_everyone(table))
     reading = (
-        f"Held-out episode {demos.episode_ids[episode]}: the recorded action, and the first action of what "
-        f"{one.policy} ({one.observations}) predicts at each frame. Seed {one.seeds[0]}. {_left_out(feature.names)}"
+        "Choose an episode that these policies were not trained on, an action, and how far ahead. The broad line is the action "
+        "that was recorded; another line is what a policy, asked that much earlier, said it would be, with its first training "
+        f"seed. A policy that does not look so far ahead has none. Click a name to single it out. {lines.left_out}"
     )
-    return Figure(
-        "What would the policy have done in a demonstration that it never saw?", reading.strip(), tuple(panels)
-    )
+    return Figure("Look for yourself: what would each policy have done?", reading.strip(), (Panel("", chart),))
 
 
 def scatter_figure(demos: Demonstrations, semantics: Semantics, one: Predictions, everyone: Sequence[str]) -> Figure:
@@ -344,12 +329,16 @@ def rollout_figure(rollouts: Sequence[Rollouts], demos: Demonstrations) -> Figur
     best = max(drawn, key=lambda one: (one.success.mean(), one.best_reward.mean()))
     feature = demos.features[ACTION]
     unit = feature.units[0]
-    chart = planes.rollout_paths(best.paths, best.success, names=feature.names[:2], unit=unit, down=_counts_down(unit))
+    some = np.linspace(0, len(best.success) - 1, min(DRIVES, len(best.success))).round().astype(int)
+    chart = planes.rollout_paths(
+        best.paths[some], best.success[some], names=feature.names[:2], unit=unit, down=_counts_down(unit)
+    )
     reading = (
         f"{best.policy} ({best.observations}, seed {best.seed}) drives by itself in the simulator {best.simulator} "
         f"{best.simulator_version} from {len(best.success)} numbered start states; a dot where each drive begins. "
         f"Task done in {int(best.success.sum())}."
     )
+    reading += f" {len(some)} of the drives are drawn." if len(some) < len(best.success) else ""
     caption = f"{best.policy}, observation set {best.observations}"
     return Figure("Where does the best policy go when it drives by itself?", reading, (Panel(caption, chart),))
 

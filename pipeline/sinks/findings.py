@@ -252,7 +252,9 @@ def dataset_unit(table: Table) -> str:
 
 def _best(table: Table, best: Row) -> Sentence:
     interval = show_interval((best.get("interval") or {}).get("first_step_mae"))
-    value = Strong(f"{show(best['first_step_mae'])}{dataset_unit(table)}")
+    mixed = common_unit(table["dataset"]["action_units"]) == "mixed units"
+    value = Strong(f"{show(best['first_step_mae'])}{'' if mixed else dataset_unit(table)}")
+    average = "on average over columns of different units" if mixed else "on average"
     held_out = plural(len({episode for fold in table["split"]["folds"] for episode in fold["test"]}), "episode")
     every = (
         f"Of the rows on all {held_out} held out, closest" if any(map(is_elsewhere, table["policies"])) else "Closest"
@@ -262,7 +264,7 @@ def _best(table: Table, best: Row) -> Sentence:
         *who(best),
         f": in {held_out} that it never saw its next action is off by ",
     ]
-    said += [value, f" on average{f' {interval}' if interval else ''} (first-step MAE). "]
+    said += [value, f" {average}{f' {interval}' if interval else ''} (first-step MAE). "]
     if best["policy"] == "hold_still":
         return [*said, "So no policy is better than holding still."]
     found = compared(table, address(best), "hold_still")

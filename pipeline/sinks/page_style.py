@@ -157,10 +157,18 @@ aside ul { margin: 6px 0; padding-left: 20px; font-size: 15px; overflow-wrap: an
 .wide .panels:has(.square) { grid-template-columns: repeat(auto-fill, minmax(min(100%, 330px), 1fr)); }
 figure { min-width: 0; margin: 0; break-inside: avoid; }
 figure:only-child { max-width: 720px; }
+figure:only-child:has(.menus) { max-width: 1040px; }
 .clips { display: grid; gap: 24px; max-width: 1024px; margin-top: 14px; }
 .clips figure:only-child { max-width: none; }
 .clips video { display: block; width: 100%; height: auto; border-radius: 8px; }
 .clips p { max-width: 100ch; margin: 6px 0 0; color: var(--muted); font-size: 14px; }
+.menus { display: flex; flex-wrap: wrap; gap: 8px 22px; margin-bottom: 10px; }
+.menus label { display: flex; gap: 8px; align-items: baseline; font-size: 14px; }
+.menus .vega-bind-name { color: var(--muted); }
+.menus select {
+  max-width: 60vw; padding: 5px 8px; border: 1px solid var(--muted); border-radius: 6px; background: var(--page);
+  color: var(--ink); font: inherit;
+}
 figcaption { margin-bottom: 4px; font-size: 14px; font-weight: 600; overflow-wrap: anywhere; }
 .chart { width: 100%; min-height: 60px; }
 .chart svg { max-width: 100%; height: auto; overflow: visible; }
@@ -180,18 +188,19 @@ dl {
 dt { font-weight: 600; }
 dd { margin: 0; color: var(--muted); overflow-wrap: anywhere; }
 pre {
-  padding: 12px 16px; border: 1px solid var(--line); border-radius: 6px; background: var(--soft); overflow-x: auto;
+  padding: 12px 16px; border: 1px solid var(--line); border-radius: 6px; background: var(--soft);
+  white-space: pre-wrap; overflow-wrap: anywhere;
 }
 code { font: 14px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace; }
 
 @media screen and (max-width: 1180px) {
   .sideways { display: inline; }
 }
-@media (max-width: 900px) {
+@media screen and (max-width: 900px) {
   .figures { display: block; }
   .figures section { margin-top: 40px; }
 }
-@media (max-width: 600px) {
+@media screen and (max-width: 600px) {
   main { padding: 22px 16px 48px; }
   h1 { font-size: 27px; }
   h2 { font-size: 18px; }
@@ -214,18 +223,52 @@ code { font: 14px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu San
 }
 @media print {
   @page { size: A4 landscape; margin: 12mm; }
+  :root { color-scheme: light; }
   * { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
   body { font-size: 10.5pt; }
   main { max-width: none; padding: 0; }
   section { margin-top: 24px; }
+  h1, h2, h3, figcaption, summary, section > p { break-after: avoid; }
+  tr, figure, dl > div, .card > p { break-inside: avoid; }
+  caption, thead { break-after: avoid; }
+  tbody tr:first-child { break-before: avoid; }
+  .short + section { break-before: page; }
   .short { margin: 16px 0 0; }
-  .scroll { overflow: visible; }
+  .short > p { font-size: 14pt; }
+  .short dl { font-size: 10.5pt; }
+  .short dl > div { padding: 5px 0; }
+  .scroll { overflow: visible; background: none; }
+  .name, caption { position: static; }
+  caption { max-width: none; }
   table { font-size: 8pt; }
   thead th, td small, th small { font-size: 7pt; }
   th, td { padding: 3px 5px; }
   .range { width: 96px; }
-  .card { break-inside: avoid; }
+  .words .wraps { min-width: 0; }
+  summary { padding: 0; border: 0; background: none; list-style: none; }
   details::details-content { display: block; content-visibility: visible; }
+  .menus { display: none; }
+  .figures { display: block; }
+  .figures section { margin-top: 24px; }
+  .card { break-inside: avoid; }
+  .figures > .card:not(.wide) { display: inline-block; width: 47%; margin-right: 2%; vertical-align: top; }
+  .chart svg { max-height: 150mm; }
+  figure:has(.menus) svg { width: auto; max-height: 125mm; }
+  .panels:has(.square) { grid-template-columns: repeat(auto-fill, minmax(min(100%, 190px), 1fr)); }
+  .wide .panels:has(.square) { grid-template-columns: repeat(auto-fill, minmax(min(100%, 280px), 1fr)); }
+  .notes, caption, .card > p, .clips p, dl { font-size: 9.5pt; }
+  .clips video { width: auto; max-width: 100%; max-height: 135mm; }
+  video::-webkit-media-controls { display: none; }
+}
+@media print and (max-width: 820px) {
+  .short dl > div { grid-template-columns: 11em minmax(0, 1fr); }
+  .scroll:not(.words) table { font-size: 5.6pt; }
+  .scroll:not(.words) :is(thead th, td small, th small) { font-size: 5pt; }
+  .scroll:not(.words) :is(th, td) { padding: 2px; }
+  .scroll:not(.words) .swatch { width: 6px; height: 6px; margin-right: 3px; border-radius: 2px; }
+  .scroll:not(.words) tbody th.name small { padding-left: 9px; }
+  .range { display: none; }
+  .figures > .card:not(.wide) { display: block; width: auto; margin-right: 0; }
 }
 """
 
@@ -242,11 +285,16 @@ function fitted(spec, width) {
     const side = Math.max(160, Math.min(spec.width, width - 76));
     return {...spec, width: side, height: side};
   }
+  if (spec.usermeta && spec.usermeta.stacked) return widened(spec, Math.max(220, width - 56));
   return {...spec, width: "container", autosize: {type: "fit-x", contains: "padding"}};
+}
+function widened(view, width) {
+  return view.vconcat ? {...view, vconcat: view.vconcat.map((part) => widened(part, width))} : {...view, width};
 }
 for (const place of document.querySelectorAll("[data-chart]")) {
   const spec = charts[Number(place.dataset.chart)];
-  vegaEmbed(place, fitted(spec, place.clientWidth), options).then(() => {
+  const menus = document.querySelector(`[data-menus="${place.dataset.chart}"]`);
+  vegaEmbed(place, fitted(spec, place.clientWidth), menus ? {...options, bind: menus} : options).then(() => {
     // The place is one picture with one description; marks inside that call themselves pictures would need theirs.
     place.querySelector("svg").setAttribute("aria-hidden", "true");
   }).catch((error) => {

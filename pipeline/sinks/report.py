@@ -9,9 +9,10 @@ names and no request to anywhere, so even a name that slipped through the escapi
 
 import base64
 import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from pipeline.sinks import explanations, replacing
 from pipeline.sinks.findings import BEST, FLOOR, MORE, Command, Sentence, Strong, answers, key_of
 from pipeline.sinks.markup import Html, element, join, json_for_script, script_text
 from pipeline.sinks.page_style import draw_script, style_sheet, themed
+from pipeline.sinks.palette import CONFIG
 from pipeline.sinks.report_sections import (
     closed_loop_section,
     comparison_section,
@@ -34,6 +36,12 @@ if TYPE_CHECKING:
     from pipeline.sinks.figures import Figure
 
 Table = Mapping[str, Any]
+NO_SCRIPT = (
+    "Without JavaScript the pictures below stand still: nothing can be chosen in them, or read off by pointing at it. The script "
+    "is in this file; nothing is loaded from anywhere."
+)
+MOST_STILL = 250_000
+"""Characters of a picture for readers without JavaScript; a larger one is left out, and its place says so."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +144,7 @@ def _body(
         _in_short(table, figures),
         element("section", benchmark_table(table), _notes(table), column_table(table)),
         _warnings(provenance.warnings),
-        element("noscript", element("p", "The pictures below need JavaScript; nothing is loaded from anywhere.")),
+        element("noscript", element("p", NO_SCRIPT)),
         floor_section(table, sections["floors"]),
         sensor_section(table),
         modes_section(table),
@@ -227,13 +235,34 @@ def _figure(figure: "Figure", place: int, specs: Sequence[Mapping[str, Any]]) ->
     for number, panel in enumerate(figure.panels, place):
         is_square = bool(specs[number].get("usermeta", {}).get("square"))
         label = f"{figure.question} {panel.caption}".strip()
-        slot = element("div", class_="chart", data_chart=number, role="img", aria_label=label)
+        still = element("noscript", _still(json.dumps(specs[number])))
+        slot = element("div", still, class_="chart", data_chart=number, role="img", aria_label=label)
         caption = element("figcaption", panel.caption) if panel.caption else None
-        panels.append(element("figure", caption, slot, class_="square" if is_square else None))
-    is_wide = len(panels) > (2 if is_square else 1)
+        menus = element("div", class_="menus", data_menus=number) if _has_menus(specs[number]) else None
+        panels.append(element("figure", caption, menus, slot, class_="square" if is_square else None))
+    is_wide = len(panels) > (2 if is_square else 1) or menus is not None
     head = [element("h2" if figure.about == "policies" else "h3", figure.question), element("p", figure.reading)]
     body = element("div", panels, class_="panels")
     return element("section", head, body, class_="card wide" if is_wide else "card")
+
+
+@lru_cache(maxsize=64)
+def _still(spec: str) -> Html:
+    """A chart as it looks before anything is chosen, in the page's colours; the script draws it again where there is one."""
+    import vl_convert
+
+    config = themed(CONFIG) | {"background": "transparent", "aria": False}
+    drawn = vl_convert.vegalite_to_svg(json.loads(spec), config=config, allowed_base_urls=[])
+    return (
+        Html(drawn)
+        if len(drawn) <= MOST_STILL
+        else element("p", "This picture has too many points to stand here without JavaScript.")
+    )
+
+
+def _has_menus(spec: Mapping[str, Any]) -> bool:
+    """Whether a reader chooses what a chart shows: the menus stand above it, outside of what is one picture."""
+    return any(isinstance(param.get("bind"), dict) for param in spec.get("params", ()))
 
 
 def _definitions(entries: Mapping[str, str]) -> Html:

@@ -55,6 +55,11 @@ def test_the_answer_of_a_benchmark(table):
     assert Command("demobench compare small/mlp_k01/state small/mlp_k04/state") in answer(table)[1]
 
 
+def test_a_mean_over_columns_of_different_units_has_none(table):
+    table["dataset"]["action_units"] = ["deg", "%"]
+    assert "its next action is off by 4.50 on average over columns of different units [4.05, 4.95]" in said(table)[0]
+
+
 def test_answers_stand_under_the_questions_that_they_answer(table):
     assert {question: len(sentences) for question, sentences in answers(table).items()} == {
         "Which policy is best?": 2, "How good can it get?": 1, "How does it do by itself?": 1,

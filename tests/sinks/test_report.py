@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import StoreError
+from pipeline.sinks import report
 from pipeline.sinks.figures import benchmark_figures
 from pipeline.sinks.markup import outside_references
 from pipeline.sinks.report import Provenance, render_report, write_report
@@ -24,6 +25,7 @@ from .making import (
     make_bracket,
     make_comparison,
     make_demos,
+    make_gap,
     make_refusal,
     make_row,
     make_semantics,
@@ -41,8 +43,8 @@ def figures(table, demos, semantics, predictions, floor, rollouts):
 
 
 def text_of(page: str) -> str:
-    """The words of the body, scripts left out; an observation set comes twice, for wide and for narrow screens."""
-    body = re.sub(r"<(script|style)\b.*?</\1>", " ", page.partition("<body>")[2], flags=re.S)
+    """The words of the body, scripts and pictures left out."""
+    body = re.sub(r"<(script|style|svg)\b.*?</\1>", " ", page.partition("<body>")[2], flags=re.S)
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", body)).split())
 
 
@@ -313,6 +315,104 @@ def test_hostile_names_do_nothing_in_a_browser(browser, tmp_path):
     assert page.locator("img").count() == 0
     assert page.locator("h1").inner_text() == f"</title>{NASTY}"
     page.close()
+
+
+def test_a_reader_chooses_what_is_drawn(browser, tmp_path, table, figures):
+    write_report(tmp_path / "report.html", table, figures, PROVENANCE)
+    page, asked, said = visit(browser, tmp_path / "report.html")
+    place = page.locator("figure:has(.menus) .chart")
+    lines = "[...document.querySelectorAll('figure:has(.menus) .mark-line path')].map(line => line.getAttribute('d'))"
+    menus = {name: page.locator(f".menus select[name={name}]") for name in ("episode", "column", "ahead")}
+    assert page.locator(".menus .vega-bind-name").all_inner_texts() == ["Episode", "Action", "How far ahead"]
+    assert {name: menu.input_value() for name, menu in menus.items()} == {
+        "episode": "8 (largest error)", "column": "x (px)", "ahead": "first action",
+    }  # fmt: skip
+    assert "mlp_k01: 5" in place.inner_text()  # the predictions are the recorded actions, and 5 px beside them
+    seen = [page.evaluate(lines)]
+    for name, value in (("episode", "9 (smallest error)"), ("column", "y (px)"), ("ahead", "0.2 s ahead")):
+        menus[name].select_option(value)
+        page.wait_for_timeout(200)
+        seen.append(page.evaluate(lines))
+    assert len({tuple(paths) for paths in seen}) == 4
+    assert "episode 9 (smallest error), 0.2 s ahead" in place.inner_text()
+    assert "mlp_k01: " not in place.inner_text()  # its chunk ends before
+    assert "mlp_k04: 5" in place.inner_text()
+    assert said == []
+    assert len(asked) == 1
+    page.emulate_media(media="print")
+    assert not page.locator(".menus").is_visible()
+    page.close()
+
+
+def test_without_javascript_every_picture_stands_still(browser, tmp_path, table, figures):
+    write_report(tmp_path / "report.html", table, figures, PROVENANCE)
+    context = browser.new_context(java_script_enabled=False)
+    page = context.new_page()
+    page.goto((tmp_path / "report.html").as_uri())
+    places = page.locator("[data-chart]")
+    assert places.count() == sum(len(figure.panels) for figure in figures)
+    for place in places.all():
+        assert place.locator("svg").bounding_box()["height"] > 50
+    assert "episode 8 (largest error), first action" in page.locator("figure:has(.menus)").inner_text()
+    assert "Without JavaScript the pictures below stand still" in page.locator("main").inner_text()
+    context.close()
+
+
+def test_a_picture_of_too_many_points_is_left_out_for_want_of_javascript(monkeypatch, table, figures):
+    monkeypatch.setattr("pipeline.sinks.report.MOST_STILL", 20_000)
+    report._still.cache_clear()
+    page = render_report(table, figures, PROVENANCE)
+    report._still.cache_clear()
+    assert "This picture has too many points to stand here without JavaScript." in page
+    assert "<noscript><svg" in page
+
+
+@pytest.mark.parametrize("paper", [(1123, 794), (794, 1123)], ids=["landscape", "portrait"])
+def test_on_paper_nothing_is_cut(browser, tmp_path, table, figures, clip, paper):
+    """A4 less margins of 12 mm, with every column that the table can have, and a dark screen."""
+    full_of_columns(table)
+    write_report(tmp_path / "report.html", table, figures, PROVENANCE, [clip])
+    page, _, _ = visit(browser, tmp_path / "report.html", viewport={"width": 1300, "height": 900}, color_scheme="dark")
+    page.emulate_media(media="print")
+    inside = paper[0] - 91
+    page.set_viewport_size({"width": inside, "height": paper[1] - 91})
+    right = "[...document.querySelectorAll('td, th, svg, pre, video, dd, p')].map(e => e.getBoundingClientRect().right)"
+    assert max(page.evaluate(right)) <= inside + 1
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    page.close()
+
+
+def test_a_desk_shows_every_column(browser, tmp_path, table, figures):
+    full_of_columns(table)
+    write_report(tmp_path / "report.html", table, figures, PROVENANCE)
+    page, _, _ = visit(browser, tmp_path / "report.html", viewport={"width": 1300, "height": 900})
+    beyond = "[...document.querySelectorAll('.scroll')].map(one => one.scrollWidth - one.clientWidth)"
+    assert set(page.evaluate(beyond)) == {0}
+    assert not page.locator(".sideways").first.is_visible()
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate(beyond)[0] > 0
+    assert page.locator(".sideways").first.is_visible()
+    page.close()
+
+
+def full_of_columns(table) -> None:
+    """A champion, a safety layer that stepped in, long names and numbers: the widest that a table of one unit gets."""
+    safety = {
+        "interventions": 9,
+        "intervened": 0.1234,
+        "mean_intervention": 0.25,
+        "stopped": 0,
+        "stopped_not_finite": 0,
+    }
+    rolled = table["policies"][1]["rollouts"] | safety
+    rolled |= {"episodes": 1500, "score_interval": [0.912, 0.987], "success_interval": [0.55, 0.68]}
+    for row in table["policies"]:
+        words = dict.fromkeys(("vs_hold_still", "vs_champion", "vs_hold_still_at_one_second"), "cannot tell")
+        row |= {
+            "rollouts": rolled, "verdict": make_verdict(**words), "at_one_second_mae": 41.25, "whole_chunk_mae": 31.25,
+            "above_floor": [make_gap()], "latency_p99_ms": 12.345, "misses_deadline": False, "params": 2150944,
+        }  # fmt: skip
+    table["comparisons"].append(make_comparison("mlp_k04/state", "mlp_k01/state", "cannot tell"))
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
