@@ -314,6 +314,7 @@ def _write_report(bench: Bench, draft) -> Outcome:
     from pipeline.sinks.pictures import picture_table
     from pipeline.sinks.report import Provenance, write_report
     from pipeline.sinks.report_video import Clip
+    from pipeline.sinks.settings_file import command_is_enough, settings_file
     from pipeline.statistics.radius import load_floors
 
     plan = bench.plan
@@ -332,12 +333,16 @@ def _write_report(bench: Bench, draft) -> Outcome:
         [one for u in rolled for one in load_rollouts(plan.folder(u))],
         _curves(bench),
     )
+    enough = command_is_enough(bench.experiment)
+    command = bench.experiment.command if enough else f"demobench run {bench.experiment.name}"
     provenance = Provenance(
-        command=bench.experiment.command + _choice_of_policies(bench, built),
+        command=command + _choice_of_policies(bench, built),
         history=bench.experiment.history,
         version=project_version(),
         made_at=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         warnings=tuple(bench.summary(Unit("demonstrations"))["inspect"]["warnings"]),
+        settings=settings_file(bench.experiment),
+        needs=not enough,
     )
     page = draft / "report.html"
     clips = [Clip(video, path, path.with_suffix(".png")) for video, path in driven_videos(bench)]

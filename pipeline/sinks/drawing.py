@@ -13,6 +13,7 @@ from typing import Any
 
 import altair as alt
 import numpy as np
+from altair.utils.schemapi import debug_mode
 
 from pipeline.sinks.palette import CONFIG, policy_colours
 
@@ -40,8 +41,9 @@ def with_unit(what: str, unit: str | None) -> str:
 
 
 def inline(rows: Rows) -> alt.InlineData:
-    """Rows as the data of a chart, inside its definition."""
-    return alt.InlineData(values=rows)
+    """Rows as the data of a chart, inside its definition; Altair would take seconds to find that rows may be anything."""
+    with debug_mode(False):
+        return alt.InlineData(values=rows)
 
 
 def colour_by_policy(policies: Iterable[str], everyone: Iterable[str], **more: Any) -> alt.Color:

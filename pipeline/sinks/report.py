@@ -53,6 +53,8 @@ class Provenance:
     version   of this project, with a commit where there is one
     made_at   when, in words; empty leaves it out
     warnings  what differed from expectation in the data set
+    settings  all of them, as the text of a `demobench.toml`; empty leaves them out
+    needs     whether the command needs them in a file
     """
 
     command: str
@@ -60,6 +62,8 @@ class Provenance:
     version: str
     made_at: str = ""
     warnings: tuple[str, ...] = ()
+    settings: str = ""
+    needs: bool = False
 
 
 def write_report(
@@ -269,12 +273,18 @@ def _definitions(entries: Mapping[str, str]) -> Html:
     return element("dl", [element("div", element("dt", term), element("dd", text)) for term, text in entries.items()])
 
 
-def _again(table: Table, provenance: Provenance) -> list[Html]:
+def _again(table: Table, provenance: Provenance) -> list[Html | None]:
     opened = explanations.files(table)
+    where = f"In a folder {'that holds the settings below as' if provenance.needs else 'without a'} demobench.toml:"
+    listed = element("pre", element("code", provenance.settings), tabindex="0")
+    folded = element("details", element("summary", "All settings, as a demobench.toml"), listed)
     parts = [
+        element("p", where),
         element("pre", element("code", provenance.command)),
+        folded if provenance.settings else None,
         _definitions(explanations.identity(table, provenance.version, provenance.made_at)),
     ]
     if opened:
-        parts += [element("h3", "The files beside this page"), _definitions(opened)]
+        beside = "The files beside this page; commands are for the folder that it lies in"
+        parts += [element("h3", beside), _definitions(opened)]
     return parts

@@ -204,6 +204,15 @@ def hostile_page() -> str:
     return render_report(table, benchmark_figures(table, demos, semantics, []), provenance)
 
 
+def test_the_settings_that_give_the_numbers_again_are_there(table, figures):
+    page = render_report(table, figures, replace(PROVENANCE, settings='[benchmark]\nprotocol = "strict"\n'))
+    assert 'All settings, as a demobench.toml [benchmark] protocol = "strict" Data set small' in text_of(page)
+    assert f"In a folder without a demobench.toml: {PROVENANCE.command} All settings" in text_of(page)
+    page = text_of(render_report(table, figures, replace(PROVENANCE, settings="[benchmark]", needs=True)))
+    assert f"In a folder that holds the settings below as demobench.toml: {PROVENANCE.command} All settings" in page
+    assert "All settings" not in text_of(render_report(table, figures, PROVENANCE))
+
+
 def test_names_from_a_data_set_stay_text():
     page = hostile_page()
     assert NASTY not in page
