@@ -65,8 +65,9 @@ def held_out_lines(
     ]
     longest = max(demos.episode(e).stop - demos.episode(e).start for e in shown)
     sets = dict.fromkeys(one.observations for one in chosen if _asks(one.policy))
+    begin = ahead(_begin(chosen, steps, demos.fps), demos.fps)
     return HeldOut(
-        rows, tuple(labels[e] for e in sorted(shown)), tuple(names), tuple(words), _begin(words),
+        rows, tuple(labels[e] for e in sorted(shown)), tuple(names), tuple(words), begin,
         tuple(sets) if len(sets) > 1 else (), tuple(dict.fromkeys(one.policy for one in chosen)),
         _said(len(shown), len(episodes), best, -(-longest // points), absent),
     )  # fmt: skip
@@ -99,8 +100,10 @@ def _horizons(chosen: Sequence[Predictions], fps: float) -> list[int]:
     return sorted({h for h in asked if h < longest})
 
 
-def _begin(words: Sequence[str]) -> str:
-    return "one second ahead" if "one second ahead" in words else words[0]
+def _begin(chosen: Sequence[Predictions], steps: Sequence[int], fps: float) -> int:
+    """The furthest horizon up to a second that at least half of the trained policies reach: there is most to compare."""
+    reach = [one.actions.shape[2] for one in chosen if one.policy not in METHODS] or [max(steps) + 1]
+    return max(h for h in steps if h <= round(fps) and (h == 0 or 2 * sum(h < k for k in reach) >= len(reach)))
 
 
 def _column_names(demos: Demonstrations) -> list[str]:

@@ -257,6 +257,10 @@ code { font: 14px/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu San
   .panels:has(.square) { grid-template-columns: repeat(auto-fill, minmax(min(100%, 190px), 1fr)); }
   .wide .panels:has(.square) { grid-template-columns: repeat(auto-fill, minmax(min(100%, 280px), 1fr)); }
   .notes, caption, .card > p, .clips p, dl { font-size: 9.5pt; }
+  p, li, dd { orphans: 3; widows: 3; }
+  .clips { display: block; }
+  .clips figure { margin-bottom: 20px; }
+  .wide .square svg { width: auto; max-height: 66mm; }
   .clips video { width: auto; max-width: 100%; max-height: 135mm; }
   video::-webkit-media-controls { display: none; }
 }

@@ -334,18 +334,18 @@ def test_a_reader_chooses_what_is_drawn(browser, tmp_path, table, figures):
     menus = {name: page.locator(f".menus select[name={name}]") for name in ("episode", "column", "ahead")}
     assert page.locator(".menus .vega-bind-name").all_inner_texts() == ["Episode", "Action", "How far ahead"]
     assert {name: menu.input_value() for name, menu in menus.items()} == {
-        "episode": "8 (largest error)", "column": "x (px)", "ahead": "first action",
+        "episode": "8 (largest error)", "column": "x (px)", "ahead": "0.2 s ahead",
     }  # fmt: skip
-    assert "mlp_k01: 5" in place.inner_text()  # the predictions are the recorded actions, and 5 px beside them
+    assert "mlp_k04: 5" in place.inner_text()  # the predictions are the recorded actions, and 5 px beside them
+    assert "mlp_k01: " not in place.inner_text()  # its chunk ends before
     seen = [page.evaluate(lines)]
-    for name, value in (("episode", "9 (smallest error)"), ("column", "y (px)"), ("ahead", "0.2 s ahead")):
+    for name, value in (("episode", "9 (smallest error)"), ("column", "y (px)"), ("ahead", "first action")):
         menus[name].select_option(value)
         page.wait_for_timeout(200)
         seen.append(page.evaluate(lines))
     assert len({tuple(paths) for paths in seen}) == 4
-    assert "episode 9 (smallest error), 0.2 s ahead" in place.inner_text()
-    assert "mlp_k01: " not in place.inner_text()  # its chunk ends before
-    assert "mlp_k04: 5" in place.inner_text()
+    assert "episode 9 (smallest error), first action" in place.inner_text()
+    assert "mlp_k01: 5" in place.inner_text()
     assert said == []
     assert len(asked) == 1
     page.emulate_media(media="print")
@@ -362,7 +362,7 @@ def test_without_javascript_every_picture_stands_still(browser, tmp_path, table,
     assert places.count() == sum(len(figure.panels) for figure in figures)
     for place in places.all():
         assert place.locator("svg").bounding_box()["height"] > 50
-    assert "episode 8 (largest error), first action" in page.locator("figure:has(.menus)").inner_text()
+    assert "episode 8 (largest error), 0.2 s ahead" in page.locator("figure:has(.menus)").inner_text()
     assert "Without JavaScript the pictures below stand still" in page.locator("main").inner_text()
     context.close()
 
