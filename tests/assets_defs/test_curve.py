@@ -190,12 +190,14 @@ def test_the_report_shows_the_curve_from_the_next_run_on(tmp_path):
     benchmark = TinyBenchmark(folder, Store(tmp_path / "results").ensure(), RAW)
     benchmark.run(policies=("mlp",))
     page = benchmark.plan().folder(Unit("benchmark_report")) / "report.html"
-    assert "Would more demonstrations help?" not in page.read_text()
+    asks = "Not asked yet: <code>demobench curve tiny</code>"
+    assert asks in page.read_text()
     _, run, why = run_curve(benchmark)
     assert run.is_success, why
     assert benchmark.run(policies=("mlp",))[0] == ["benchmark_report"]
     shown = page.read_text()
-    assert "Would more demonstrations help?" in shown
+    assert asks not in shown
+    assert shown.count("Would more demonstrations help?</h2>") == 1
     said = benchmark.store.made(benchmark.plan().folder(UNIT)).summary["answers"][0]["words"]
     assert said.split(":")[0] in shown
     forgotten = TinyBenchmark(folder, benchmark.store, {**RAW, "policies": {"mlp": {"method": "mlp", "chunks": [4]}}})
