@@ -78,7 +78,7 @@ def close_dead_runs(instance: dg.DagsterInstance, clock: Callable[[], float] = t
     under_way = [dg.DagsterRunStatus.STARTING, dg.DagsterRunStatus.STARTED, dg.DagsterRunStatus.CANCELING]
     words = []
     for record in instance.get_run_records(dg.RunsFilter(statuses=under_way)):
-        why = _why_dead(record, clock())
+        why = _why_dead(instance, record, clock())
         if why is not None:
             run = record.dagster_run
             instance.report_run_failed(run, message=f"{why[0].upper()}{why[1:]}.")
@@ -86,16 +86,22 @@ def close_dead_runs(instance: dg.DagsterInstance, clock: Callable[[], float] = t
     return words
 
 
-def _why_dead(record: dg.RunRecord, now_s: float) -> str | None:
+def _why_dead(instance: dg.DagsterInstance, record: dg.RunRecord, now_s: float) -> str | None:
     """Why a run that is under way will never end; None where its process is there, or nobody here can tell."""
     tags = record.dagster_run.tags
-    if HOST_TAG not in tags:
+    if HOST_TAG not in tags or _is_parents(instance, tags):
         waited_s = now_s - record.update_timestamp.timestamp()
         return "it was started and never got a process" if waited_s > START_S else None
     started_s = record.start_time or record.create_timestamp.timestamp()
     if tags[HOST_TAG] != socket.gethostname() or _runs(int(tags[PID_TAG]), started_s):
         return None
     return f"the process {tags[PID_TAG]} that made it is gone"
+
+
+def _is_parents(instance: dg.DagsterInstance, tags: Mapping[str, str]) -> bool:
+    """Whether the process that a run names is that of the run which it repeats: it brings the tags along, until it has its own."""
+    parent = instance.get_run_by_id(tags["dagster/parent_run_id"]) if "dagster/parent_run_id" in tags else None
+    return parent is not None and parent.tags.get(PID_TAG) == tags[PID_TAG]
 
 
 def _runs(pid: int, started_s: float) -> bool:

@@ -74,6 +74,20 @@ def test_a_run_that_never_got_a_process_or_whose_process_left_its_number_to_anot
         assert words.startswith(f"closed run {old.run_id[:8]} of tiny: the process {os.getpid()}")
 
 
+def test_a_run_that_is_made_again_is_not_closed_for_the_process_of_the_first_one(finished):
+    with open_instance(finished.store.root) as instance:
+        job, under_way = finished.defs().resolve_job_def("benchmark"), dg.DagsterRunStatus.STARTED
+        tags = {PID_TAG: str(2**22 + 1), HOST_TAG: socket.gethostname(), "dagster/partition": "tiny"}
+        first = instance.create_run_for_job(job_def=job, tags=tags, status=dg.DagsterRunStatus.SUCCESS)
+        tags["dagster/parent_run_id"] = first.run_id
+        second = instance.create_run_for_job(job_def=job, tags=tags, status=under_way)
+        assert close_dead_runs(instance) == []
+        assert instance.get_run_by_id(second.run_id).status == under_way
+        instance.add_run_tags(second.run_id, {PID_TAG: str(2**22 + 2)})
+        (words,) = close_dead_runs(instance)
+        assert words.startswith(f"closed run {second.run_id[:8]} of tiny: the process {2**22 + 2}")
+
+
 def test_another_budget_in_the_launchpad_is_the_command_lines_variant(finished):
     workbench = finished.defs().resources["workbench"]
     context = dg.build_asset_context(partition_key="tiny")
