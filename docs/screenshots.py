@@ -36,6 +36,8 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+SHOWN = "so101_sim"
+"""The data set of most pictures."""
 PATIENCE_S = 300
 COLOURS = 256
 
@@ -57,7 +59,7 @@ class Scene:
 
 def report(scene: Scene, path: Path, width: int = 1300, height: int = 1015, **context: Any) -> None:
     page = scene.page(width, height, **context)
-    page.goto((scene.store.folder("pusht_sim", "benchmark_report") / "report.html").as_uri())
+    page.goto((scene.store.folder(SHOWN, "benchmark_report") / "report.html").as_uri())
     page.locator("[data-chart] svg").first.wait_for(state="attached")
     page.screenshot(path=path)
 
@@ -78,6 +80,7 @@ def graph(scene: Scene, path: Path) -> None:
         for name in ("data", "floor", "elsewhere", "looking")
     ]
     outermost[-1].wait_for()
+    page.get_by_text("fetching statuses").first.wait_for(state="detached")
     page.wait_for_timeout(3000)  # the graph glides into its place
     left, top, bottom, right = (group.bounding_box() for group in outermost)
     width, height = right["x"] - left["x"] + 320, bottom["y"] - top["y"] + 140
@@ -86,7 +89,7 @@ def graph(scene: Scene, path: Path) -> None:
 
 def asset(scene: Scene, path: Path) -> None:
     page = scene.page(1500, 1000)
-    page.goto(f"{scene.dagster}/assets/mlp_k16/predictions?view=partitions&partition=pusht_sim")
+    page.goto(f"{scene.dagster}/assets/recipe_k32/predictions?view=partitions&partition={SHOWN}")
     page.get_by_text("Show Markdown").last.click()
     page.locator("img[src^='data:image/png']").first.wait_for()
     page.screenshot(path=path)
@@ -94,7 +97,7 @@ def asset(scene: Scene, path: Path) -> None:
 
 def mlflow(scene: Scene, path: Path) -> None:
     page = scene.page(1600, 1000)
-    experiment = Outbox(scene.store, "sqlite").experiment_id("pusht_sim")
+    experiment = Outbox(scene.store, "sqlite").experiment_id(SHOWN)
     view = f"viewStateShareKey={VIEW}&compareRunsMode=CHART"
     page.goto(f"{scene.mlflow}/#/experiments/{experiment}/runs?{view}")
     page.get_by_text("first_step_mae").first.wait_for()

@@ -357,7 +357,7 @@ def floor_figure(demos: Demonstrations, semantics: Semantics, floors: Sequence[R
         chart = planes.floor_scatter(
             floor.crowded.actions[:, pair], state, names=names, unit=unit, down=_counts_down(unit)
         )
-        within = f"{floor.radius:g} {'training deviations' if floor.scaled else unit or ''}".strip()
+        within = f"{floor.radius:.3g} {'training deviations' if floor.scaled else unit or ''}".strip()
         panels.append(Panel(f"{floor.observations}: {len(floor.crowded.frames)} frames within {within}", chart))
     if not panels:
         return None

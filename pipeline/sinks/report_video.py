@@ -27,11 +27,12 @@ def video_section(clips: Sequence[Clip], left_out: Mapping[str, str]) -> Html | 
         return None
     why = [element("p", f"No video of {name}: {reason}") for name, reason in left_out.items()]
     said = "For each observation set the policy that does best in closed loop, from the first start states: none was picked."
+    best_first = sorted(clips, key=lambda clip: -clip.video.succeeded / len(clip.video.start_states))
     return element(
         "section",
         element("h2", "What does it look like when the best policy drives by itself?"),
         element("p", said) if clips else None,
-        element("div", [_clip(clip) for clip in clips], class_="clips"),
+        element("div", [_clip(clip) for clip in best_first], class_="clips"),
         why,
     )
 

@@ -15,7 +15,7 @@ from pipeline.sinks import report
 from pipeline.sinks.figures import benchmark_figures
 from pipeline.sinks.markup import outside_references
 from pipeline.sinks.report import Provenance, render_report, write_report
-from pipeline.sinks.report_video import Clip
+from pipeline.sinks.report_video import Clip, video_section
 from pipeline.sinks.rollout_video import write_video
 from pipeline.types import ACTION
 
@@ -267,6 +267,12 @@ def test_videos_are_in_the_page_and_the_policy_lets_them_and_nothing_else_in(tmp
         "default-src", "script-src", "style-src", "img-src", "media-src", "base-uri", "form-action",
     }  # fmt: skip
     assert outside_references(path) == []
+
+
+def test_the_video_with_the_most_successes_comes_first(clip):
+    worse, better = (replace(clip, video=replace(clip.video, succeeded=n, policy=f"p{n}")) for n in (0, 1))
+    page = str(video_section([worse, better], {}))
+    assert page.index("p1 (seeing") < page.index("p0 (seeing")
 
 
 def test_a_page_without_videos_has_no_section_and_lets_none_in(table, figures):
