@@ -75,13 +75,19 @@ class Outcome:
 
 
 class Progress:
-    """How assets tell what they are doing; the terminal replaces it with bars."""
+    """How assets tell what they are doing; the terminal replaces it with bars. `is_stopped` is asked between pieces of work."""
 
-    def __init__(self, say: Say):
+    def __init__(self, say: Say, is_stopped: Callable[[], bool] = lambda: False, every_s: float = 2.0):
         self._say = say
-        self._last = time.monotonic()
+        self._every_s = every_s
+        self._is_stopped = is_stopped
+        self._last = self._asked = time.monotonic()
 
     def __call__(self, what: str, done: int, total: int, note: str = "") -> None:
+        if time.monotonic() - self._asked > self._every_s:
+            self._asked = time.monotonic()
+            if self._is_stopped():
+                raise dg.DagsterExecutionInterruptedError
         if done >= total or time.monotonic() - self._last > 10:
             self._last = time.monotonic()
             self._say(f"{what}: {done:,} of {total:,}{', ' + note if note else ''}")
@@ -130,8 +136,14 @@ class Workbench:
         experiment.require_sets(budget.observations)
         policies = self.policies_of(experiment)
         plan = Plan(self.store, key, experiment, policies, (), tuple(budget.observations), look_at_source)
-        progress = self.progress or Progress(context.log.info)
+        progress = self.progress or Progress(context.log.info, lambda: _is_canceling(context))
         return Bench(self, plan, progress, context.log.warning, context.partition_key, context.log_event)
+
+
+def _is_canceling(context: dg.AssetExecutionContext) -> bool:
+    """Whether Terminate was pressed. Its signal may be lost: Python drops what is raised inside a garbage-collection callback."""
+    run = context.instance.get_run_by_id(context.run.run_id)
+    return run is not None and run.status == dg.DagsterRunStatus.CANCELING
 
 
 def from_base(workbench: Workbench, key: str, fallback: Experiment) -> Experiment:

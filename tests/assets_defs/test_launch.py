@@ -5,13 +5,14 @@ import signal
 import socket
 import time
 from datetime import UTC, datetime
+from types import SimpleNamespace
 
 import dagster as dg
 import pytest
 from dagster._core.test_utils import freeze_time
 
 from assets_defs.launch import HOST_TAG, PID_TAG, START_S, close_dead_runs, open_instance, run_benchmark
-from assets_defs.resources import Budget
+from assets_defs.resources import Budget, Progress, _is_canceling
 from pipeline.errors import ConfigError
 
 
@@ -35,6 +36,19 @@ def test_an_interrupted_run_ends_as_canceled(finished):
         with pytest.raises(KeyboardInterrupt):
             run_benchmark(instance, finished.defs(), "tiny", [dg.AssetKey(["episode_split"])], on_event=stop)
         assert instance.get_runs(limit=1)[0].status == dg.DagsterRunStatus.CANCELED
+
+
+def test_a_run_that_was_terminated_stops_though_the_signal_was_lost(finished):
+    with open_instance(finished.store.root) as instance:
+        job = finished.defs().resolve_job_def("benchmark")
+        run = instance.create_run_for_job(job_def=job, status=dg.DagsterRunStatus.STARTED)
+        context = SimpleNamespace(instance=instance, run=run)
+        progress = Progress(lambda words: None, lambda: _is_canceling(context), every_s=0)
+        progress("training", 1, 2)
+        instance.report_run_canceling(run)
+        with pytest.raises(dg.DagsterExecutionInterruptedError):
+            progress("training", 2, 2)
+        instance.report_run_canceled(instance.get_run_by_id(run.run_id))
 
 
 def test_runs_whose_process_is_gone_are_closed_and_others_left(finished):
