@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -12,6 +13,8 @@ import urllib.request
 
 import pytest
 
+from assets_defs.plan import Plan
+from demobench.commands.session import known_target, open_session
 from tests.makers import tiny_recording, write_v3
 
 pytestmark = pytest.mark.slow
@@ -33,6 +36,64 @@ chunks = [1]
 """
 PATIENCE_MS = 120_000
 ENDED = ("SUCCESS", "FAILURE", "CANCELED")
+MANY_STEPS = 400_000
+LAUNCH = """
+mutation Launch($asked: ExecutionParams!) {
+  launchRun(executionParams: $asked) {
+    __typename
+    ... on LaunchRunSuccess { run { runId } }
+    ... on PythonError { message }
+  }
+}"""
+TERMINATE = """
+mutation Stop($id: String!) {
+  terminateRun(runId: $id, terminatePolicy: SAFE_TERMINATE) {
+    __typename
+    ... on TerminateRunFailure { message }
+    ... on PythonError { message }
+  }
+}"""
+BACKFILL = """
+mutation Backfill($asked: LaunchBackfillParams!) {
+  launchPartitionBackfill(backfillParams: $asked) {
+    __typename
+    ... on LaunchBackfillSuccess { backfillId }
+    ... on PythonError { message }
+  }
+}"""
+BACKFILL_STATUS = """
+query Status($id: String!) {
+  partitionBackfillOrError(backfillId: $id) {
+    ... on PartitionBackfill {
+      status
+      assetBackfillData {
+        assetBackfillStatuses {
+          ... on AssetPartitionsStatusCounts { assetKey { path } numPartitionsMaterialized }
+        }
+      }
+    }
+  }
+}"""
+CHECKS = """
+{
+  assetNodeOrError(assetKey: {path: ["benchmark_table"]}) {
+    ... on AssetNode {
+      assetChecksOrError {
+        ... on AssetChecks {
+          checks {
+            name
+            executionForLatestMaterialization {
+              evaluation {
+                success
+                metadataEntries { label ... on TextMetadataEntry { text } ... on MarkdownMetadataEntry { mdStr } }
+              }
+            }
+          }
+        }
+      }
+    }
+  }
+}"""
 REEXECUTE = """
 mutation Again($parent: String!) {
   launchRunReexecution(reexecutionParams: {parentRunId: $parent, strategy: ALL_STEPS}) {
@@ -68,10 +129,13 @@ def served(tmp_path_factory):
     place = tmp_path_factory.mktemp("user")
     write_v3(place / "tape", tiny_recording(episodes=6, frames=40))
     write_v3(place / "film", tiny_recording(episodes=6, frames=40, seed=1))
+    write_v3(place / "more" / "side", tiny_recording(episodes=6, frames=40, seed=2))
     (place / "demobench.toml").write_text(CONFIG)
     environment = {**os.environ, "NO_COLOR": "1"}
     command = [sys.executable, "-m", "demobench.cli"]
-    subprocess.run([*command, "run", "tape"], cwd=place, env=environment, check=True, timeout=300, capture_output=True)
+    # One that the file names, and a folder that it does not.
+    run = [*command, "run", "tape", "more/side", "--policies", "mlp"]
+    subprocess.run(run, cwd=place, env=environment, check=True, timeout=500, capture_output=True)
     port, mlflow_port, files_port = free_port(), free_port(), free_port()
     ports = ["--port", str(port), "--mlflow-port", str(mlflow_port), "--files-port", str(files_port)]
     process = subprocess.Popen([*command, "ui", *ports], cwd=place, env=environment, stdout=subprocess.PIPE, text=True)
@@ -97,7 +161,7 @@ def graphql(address: str, query: str, **variables) -> dict:
 
 def runs(address: str) -> list[dict]:
     """All runs, the newest first, with the data set and the links that their tags name."""
-    query = "{runsOrError {... on Runs {results {runId status parentRunId tags {key value}}}}}"
+    query = "{runsOrError {... on Runs {results {runId status tags {key value} stepStats {stepKey status}}}}}"
     found = graphql(address, query)["runsOrError"]["results"]
     return [
         run
@@ -111,20 +175,192 @@ def partitions(address: str) -> list[str]:
     return graphql(address, query)["assetNodeOrError"]["partitionKeys"]
 
 
-def test_the_ui_runs_the_command_lines_run_again(served):
-    place, dagster, _ = served
-    first = runs(dagster)[-1]
-    assert first["status"] == "SUCCESS"
-    before = {p: p.read_text() for p in (place / "results" / "datasets").rglob("made.json")}
-    answer = graphql(dagster, REEXECUTE, parent=first["runId"])["launchRunReexecution"]
+def ended(address: str, run_id: str, seconds: float = 240) -> str:
+    """How a run ended."""
+    found = wait_for(lambda: [r for r in runs(address) if r["runId"] == run_id and r["status"] in ENDED], seconds)
+    return found[0]["status"]
+
+
+def again(address: str, run_id: str) -> str:
+    """Re-execute a run as the UI does; the new run's id."""
+    answer = graphql(address, REEXECUTE, parent=run_id)["launchRunReexecution"]
     assert answer["__typename"] == "LaunchRunSuccess", answer
-    again = answer["run"]["runId"]
-    done = wait_for(
-        lambda: [r for r in runs(dagster) if r["runId"] == again and r["status"] in ("SUCCESS", "FAILURE")], 240
+    return answer["run"]["runId"]
+
+
+@pytest.mark.parametrize("key", ["tape", "side"])
+def test_the_ui_runs_the_command_lines_run_again(served, key):
+    place, dagster, _ = served
+    first = next(run for run in runs(dagster) if run["partition"] == key and "dagster/parent_run_id" not in run["tags"])
+    assert first["status"] == "SUCCESS"
+    folder = place / "results" / "datasets" / key
+    before = {p: p.read_text() for p in folder.rglob("made.json")}
+    (folder / "windows" / "made.json").unlink()
+    assert ended(dagster, again(dagster, first["runId"])) == "SUCCESS"
+    after = {p: p.read_text() for p in folder.rglob("made.json")}
+    assert set(after) == set(before)
+    assert {p.parent.name for p in before if before[p] != after[p]} <= {"windows"}, "what was not stale is kept"
+
+
+def test_all_data_sets_are_made_by_one_backfill(served):
+    place, dagster, _ = served
+    wait_for(lambda: {"tape", "film", "side"} <= set(partitions(dagster)), 120)
+    assets = ("demonstrations", "episode_split", "windows")
+    asked = {"assetSelection": [{"path": [name]} for name in assets], "partitionNames": ["tape", "film", "side"]}
+    answer = graphql(dagster, BACKFILL, asked=asked)["launchPartitionBackfill"]
+    assert answer["__typename"] == "LaunchBackfillSuccess", answer
+
+    def done() -> dict | None:
+        found = graphql(dagster, BACKFILL_STATUS, id=answer["backfillId"])["partitionBackfillOrError"]
+        return None if found["status"] == "REQUESTED" else found
+
+    found = wait_for(done, 400)
+    assert found["status"] == "COMPLETED_SUCCESS"
+    counts = found["assetBackfillData"]["assetBackfillStatuses"]
+    assert {c["assetKey"]["path"][0]: c["numPartitionsMaterialized"] for c in counts} == dict.fromkeys(assets, 3)
+    made = {run["partition"]: run["status"] for run in runs(dagster) if "dagster/backfill" in run["tags"]}
+    assert made == dict.fromkeys(("tape", "film", "side"), "SUCCESS")
+    for name in assets:
+        assert (place / "results" / "datasets" / "film" / name / "made.json").exists()
+
+
+def start_training(address: str, partition: str) -> dict:
+    """Launch a training that takes minutes, as the launchpad does; the run once it is at it."""
+    assets = [["demonstrations"], ["episode_split"], ["windows"], ["mlp_k01", "trained_policy"]]
+    asked = {
+        "selector": {
+            "repositoryName": "__repository__",
+            "repositoryLocationName": "demobench",
+            "jobName": "benchmark",
+            "assetSelection": [{"path": path} for path in assets],
+        },
+        "runConfigData": {"resources": {"budget": {"config": {"steps": MANY_STEPS}}}},
+        "executionMetadata": {"tags": [{"key": "dagster/partition", "value": partition}]},
+    }
+    answer = graphql(address, LAUNCH, asked=asked)["launchRun"]
+    assert answer["__typename"] == "LaunchRunSuccess", answer
+    step = {"stepKey": "mlp_k01__trained_policy", "status": "IN_PROGRESS"}
+    found = wait_for(
+        lambda: [r for r in runs(address) if r["runId"] == answer["run"]["runId"] and step in r["stepStats"]], 240
     )
-    assert done[0]["status"] == "SUCCESS"
-    after = {p: p.read_text() for p in (place / "results" / "datasets").rglob("made.json")}
-    assert after == before, "nothing was stale, so the second run made nothing again"
+    return found[0]
+
+
+def half_made(place) -> list[str]:
+    """What is in the store of results that are not whole."""
+    folders = [p for p in (place / "results" / "datasets").glob("*/mlp_k01/trained_policy/*") if p.is_dir()]
+    return [str(p) for p in folders if not (p / "made.json").exists() or p.name.startswith(".")]
+
+
+def test_a_run_that_is_stopped_in_the_ui_is_canceled_leaves_nothing_and_can_go_on(served):
+    place, dagster, _ = served
+    wait_for(lambda: "film" in partitions(dagster), 120)
+    run_id = start_training(dagster, "film")["runId"]
+    answer = graphql(dagster, TERMINATE, id=run_id)["terminateRun"]
+    assert answer["__typename"] == "TerminateRunSuccess", answer
+    assert ended(dagster, run_id, 60) == "CANCELED"
+    assert half_made(place) == []
+    (variant,) = (place / "results" / "datasets").glob("film+*")  # another number of steps is another key
+    kept = {p: p.read_text() for p in variant.rglob("made.json")}
+    assert {p.parent.name for p in kept} >= {"demonstrations", "episode_split", "windows"}
+    second = again(dagster, run_id)
+    wait_for(lambda: [r for r in runs(dagster) if r["runId"] == second and r["status"] == "STARTED"], 120)
+    assert {p: p.read_text() for p in kept} == kept, "it goes on from what was finished"
+    graphql(dagster, TERMINATE, id=second)
+    assert ended(dagster, second, 120) == "CANCELED"
+
+
+def test_a_run_of_the_ui_that_is_killed_fails_at_once(served):
+    _, dagster, _ = served
+    wait_for(lambda: "film" in partitions(dagster), 120)
+    run = start_training(dagster, "film")
+    os.kill(int(run["tags"]["demobench/pid"]), signal.SIGKILL)
+    assert ended(dagster, run["runId"], 60) == "FAILURE"
+
+
+def kill_a_training(place) -> int:
+    """Kill a run of the command line in the middle of a training; its process."""
+    command = [sys.executable, "-m", "demobench.cli", "run", "film", "--policies", "mlp", "--steps", str(MANY_STEPS)]
+    process = subprocess.Popen(command, cwd=place, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        wait_for(lambda: [path for path in half_made(place) if f".{process.pid}." in path], 300)
+    finally:
+        process.kill()
+        process.wait(timeout=60)
+    return process.pid
+
+
+def test_a_run_of_the_command_line_that_is_killed_is_closed_by_the_ui(served):
+    place, dagster, _ = served
+    pid = str(kill_a_training(place))
+    killed = next(run for run in runs(dagster) if run["tags"].get("demobench/pid") == pid)
+    assert ended(dagster, killed["runId"], 240) == "FAILURE"
+
+
+def test_the_next_start_names_a_killed_run_closes_it_and_clears_what_it_was_writing(tmp_path):
+    write_v3(tmp_path / "film", tiny_recording(episodes=6, frames=40))
+    (tmp_path / "demobench.toml").write_text(CONFIG.replace('[datasets.tape]\nsource = "tape"\n', ""))
+    pid = kill_a_training(tmp_path)
+    assert half_made(tmp_path), "a killed process cannot clean up behind itself"
+    ports = [f"--{name}={free_port()}" for name in ("port", "mlflow-port", "files-port")]
+    words = [sys.executable, "-u", "-m", "demobench.cli", "ui", *ports]
+    process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    try:
+        said = process.stdout.readline()
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60)
+    assert re.fullmatch(
+        rf"closed run [0-9a-f]{{8}} of film\+[0-9a-f]{{8}}: the process {pid} that made it is gone\n", said
+    )
+    assert half_made(tmp_path) == []
+
+
+def planned(place) -> set[str]:
+    """The assets that `demobench run tape` would make."""
+    session = open_session(place / "demobench.toml", None)
+    target = known_target("tape", session)
+    plan = Plan(session.store, target.key, target.experiment, tuple(target.experiment.variants))
+    return {unit.asset for unit, why in plan.stale().items() if why != "never made"}
+
+
+def stale(address: str, partition: str) -> set[str]:
+    """What Dagster marks as unsynced."""
+    query = "query Q($p: [String!]) {assetNodes {assetKey {path} staleStatusByPartition(partitions: $p)}}"
+    nodes = graphql(address, query, p=[partition])["assetNodes"]
+    return {"/".join(n["assetKey"]["path"]) for n in nodes if n["staleStatusByPartition"] == ["STALE"]}
+
+
+def said_of_the_table(address: str) -> dict[str, str | bool | None]:
+    """What the check `up_to_date` says now."""
+    checks = graphql(address, CHECKS)["assetNodeOrError"]["assetChecksOrError"]["checks"]
+    found = next(c["executionForLatestMaterialization"] for c in checks if c["name"] == "up_to_date")
+    if found is None:  # a table is being made just now
+        return {"passed": None}
+    words = {e["label"]: e.get("text") or e.get("mdStr") for e in found["evaluation"]["metadataEntries"]}
+    return words | {"passed": found["evaluation"]["success"]}
+
+
+def test_what_the_ui_says_is_out_of_date_is_what_a_run_would_make(served):
+    place, dagster, _ = served
+    file, before = place / "demobench.toml", (place / "demobench.toml").read_text()
+    wait_for(lambda: (now := said_of_the_table(dagster))["passed"] and "tape" in now["why"], 150)
+    assert planned(place) == stale(dagster, "tape") == set()
+    file.write_text(before.replace("steps = 4", "steps = 5"))
+    try:
+        graphql(dagster, 'mutation {reloadRepositoryLocation(repositoryLocationName: "demobench") {__typename}}')
+        said = wait_for(lambda: (now := said_of_the_table(dagster))["passed"] is False and now, 150)
+        assets = planned(place)
+        assert said["why"] == f"tape: {len(assets)} assets are out of date", (
+            "the folder keeps the settings it was run with"
+        )
+        assert {line.split(" | ")[1] for line in said["out_of_date"].splitlines()[2:]} == assets
+        assert "mlp_k01/trained_policy" in assets
+        assert stale(dagster, "tape") <= assets
+    finally:
+        file.write_text(before)
+        graphql(dagster, 'mutation {reloadRepositoryLocation(repositoryLocationName: "demobench") {__typename}}')
+    wait_for(lambda: said_of_the_table(dagster)["passed"], 150)
 
 
 TICKS = """
@@ -192,9 +428,10 @@ def test_a_whole_graph_is_made_from_the_ui_and_leads_to_its_report_and_to_mlflow
     wait_for(
         lambda: "film" in partitions(dagster), 120
     )  # a sensor makes it known; the list in the page does not wait for it
+    before = {run["runId"] for run in runs(dagster)}
     launch(page, dagster, "film")
-    made = wait_for(lambda: [r for r in runs(dagster) if r["partition"] == "film" and r["status"] in ENDED], 500)
-    assert [run["status"] for run in made] == ["SUCCESS"]
+    made = wait_for(lambda: [r for r in runs(dagster) if r["runId"] not in before and r["status"] in ENDED], 500)
+    assert [(run["partition"], run["status"]) for run in made] == [("film", "SUCCESS")]
     table = json.loads((place / "results" / "datasets" / "film" / "benchmark_table" / "table.json").read_text())
 
     page.goto(f"{dagster}/assets/benchmark_table?partition=film")
