@@ -24,12 +24,16 @@ class Bench:
         self.anchors = anchors_of(demos, HISTORY)
         self.recorded = demos.columns[ACTION][self.anchors].astype(np.float64)
         self.mean, self.deviation = self.recorded.mean(axis=0), self.recorded.std(axis=0)
-        self.random = np.random.default_rng(0)
         self.episode = demos.episode_of_frame[self.anchors]
         self.frame = demos.frame_in_episode[self.anchors]
 
+    @property
+    def noise(self):
+        """Standard normal numbers, the same whichever test asks first."""
+        return np.random.default_rng(0).normal(size=self.recorded.shape)
+
     def noisy(self, actions, share=0.2):
-        return actions + share * self.deviation * self.random.normal(size=actions.shape)
+        return actions + share * self.deviation * self.noise
 
     def shifted(self, frames):
         first, last = self.demos.episode_starts[self.episode], self.demos.episode_starts[self.episode + 1] - 1
@@ -68,8 +72,8 @@ HONEST = {
     "mean action": lambda b: np.tile(b.mean, (len(b.anchors), 1)),
     "mean of others": lambda b: b.mean + 0.01 * b.deviation * (b.episode[:, None] % 3),
     "hold still": lambda b: b.demos.columns[STATE][b.anchors],
-    "noise like the data": lambda b: b.mean + b.deviation * b.random.normal(size=b.recorded.shape),
-    "noise of a fresh network": lambda b: 0.1 * b.random.normal(size=b.recorded.shape),
+    "noise like the data": lambda b: b.mean + b.deviation * b.noise,
+    "noise of a fresh network": lambda b: 0.1 * b.noise,
     "zeros": lambda b: np.zeros_like(b.recorded),
     "repeats the last action": lambda b: b.shifted(-1),
     "hardly leaves the mean": lambda b: b.mean + 0.0175 * (b.recorded - b.mean),
@@ -137,14 +141,14 @@ WARNED = {
     "late": (lambda b: b.noisy(b.shifted(-4), 0.1), ["4 frames earlier", "frame_index is off, or the policy repeats"]),
     "an offset": (
         lambda b: b.noisy(b.recorded) + np.array([0, 90, 0]),
-        ["off by a constant: a1 by +89.97", "Is zero elsewhere"],
+        ["off by a constant: a1 by +90.14", "Is zero elsewhere"],
     ),
     "the recording itself": (lambda b: b.recorded, ["exactly the one recorded"]),
     "columns that go with others and fit nowhere": (
         lambda b: b.mean + 3 * (b.recorded - b.mean)[:, [1, 0, 2]] + 2 * b.deviation,
         ["are action columns permuted? a0 holds a1", "they fit no place"],
     ),
-    "noise around zero": (lambda b: b.random.normal(size=b.recorded.shape), ["mean 0 and deviation 1"]),
+    "noise around zero": (lambda b: b.noise, ["mean 0 and deviation 1"]),
 }
 
 
