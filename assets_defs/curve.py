@@ -210,7 +210,7 @@ def _describe(bench: Bench, task, draft: Path) -> dict[str, Any]:
     for metric, points in read.points.items():
         picture_curve(
             points, draft / f"{metric}.png", what=METRIC_WORDS[metric].removeprefix("the "), unit=unit,
-            policy=task.variant.name, everyone=[v.name for v in bench.plan.variants], floor=read.floors.get(metric),
+            policy=task.variant.name, everyone=bench.everyone(task.variant.name), floor=read.floors.get(metric),
         )  # fmt: skip
     return read.as_json()
 

@@ -169,7 +169,7 @@ def _score(bench: Bench, request: Request, draft: Path) -> Outcome:
     )
     save_predictions(scored.predictions, draft)
     save_errors(scored.score.errors, draft / "errors.safetensors")
-    everyone = [v.name for v in bench.plan.variants] + [request.name]
+    everyone = bench.everyone(request.name)
     picture_horizons(scored.score.metrics, request.name, everyone, demos, draft / "error_by_horizon.png")
     summary = scored.summary(demos)
     asked = bench.plan.asked[request.name]

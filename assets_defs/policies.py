@@ -67,10 +67,6 @@ def _not_part(bench: Bench, variant: Variant) -> str | None:
     )
 
 
-def _everyone(bench: Bench) -> list[str]:
-    return [v.name for v in bench.plan.variants]
-
-
 def _trained_policy(variant: Variant) -> dg.AssetsDefinition:
     asset_key = dg.AssetKey([variant.name, "trained_policy"])
     method = "a baseline: nothing is trained" if not variant.is_trained else f"method `{variant.method}`"
@@ -130,7 +126,7 @@ def _train(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome:
     known = all(t.losses.size for t in folds)
     last = float(np.mean([t.losses[:, -1].mean() for t in folds])) if known else None
     if known:
-        picture_losses(folds[0], variant.name, _everyone(bench), draft / "losses.png")
+        picture_losses(folds[0], variant.name, bench.everyone(variant.name), draft / "losses.png")
     shutil.rmtree(unfinished, ignore_errors=True)
     return Outcome(
         {
@@ -220,7 +216,9 @@ def _predict(bench: Bench, variant: Variant, unit: Unit, draft: Path) -> Outcome
     samples = sampled_scores(task, bench.plan.folder(trained_unit))
     save_predictions(predicted, draft)
     save_errors(score.errors, draft / "errors.safetensors")
-    picture_horizons(score.metrics, variant.name, _everyone(bench), task.demos, draft / "error_by_horizon.png")
+    picture_horizons(
+        score.metrics, variant.name, bench.everyone(variant.name), task.demos, draft / "error_by_horizon.png"
+    )
     held_out = set(task.split.held_out)
     scored = set(score.errors.episodes.tolist())
     return Outcome(

@@ -178,6 +178,10 @@ class Bench:
     def experiment(self) -> Experiment:
         return self.plan.experiment
 
+    def everyone(self, *more: str) -> list[str]:
+        """The policies that run by themselves, and those that were named: they decide on colours, the same in every picture."""
+        return [*(v.name for v in self.plan.variants if not v.only_when_named), *more]
+
     @cached_property
     def demonstrations(self):
         from pipeline.lerobot_format.saved import load_demonstrations

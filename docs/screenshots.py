@@ -92,6 +92,7 @@ def asset(scene: Scene, path: Path) -> None:
     page.goto(f"{scene.dagster}/assets/recipe_k32/predictions?view=partitions&partition={SHOWN}")
     page.get_by_text("Show Markdown").last.click()
     page.locator("img[src^='data:image/png']").first.wait_for()
+    page.wait_for_timeout(1000)  # the picture fades in
     page.screenshot(path=path)
 
 
@@ -171,8 +172,12 @@ def wait_for(address: str) -> None:
 
 
 def shrink(path: Path) -> None:
-    """The picture with few colours: a quarter of the bytes. The rare ones are kept too: a policy is told by its colour."""
-    few = Image.open(path).convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    """The picture with few colours: a quarter of the bytes. The rare ones are kept too: a policy is told by its colour.
+
+    `kmeans` then moves each colour to the middle of what it stands for; else pale grounds turn pink.
+    """
+    method = Image.Quantize.MAXCOVERAGE
+    few = Image.open(path).convert("RGB").quantize(COLOURS, method, kmeans=2, dither=Image.Dither.NONE)
     few.save(path, optimize=True)
 
 
