@@ -426,7 +426,7 @@ def score(
 
 
 @app.command(
-    epilog="Examples:\n\n    demobench view pusht_sim 0\n\n    demobench view so101_sim 42 --policy mlp_k16\n\n"
+    epilog="Examples:\n\n    demobench view pusht_sim 0\n\n    demobench view so101_sim 36 --policy mlp_k16\n\n"
     "    demobench view pusht_sim 0 --save episode.rrd\n\n    demobench view held_out.mcap"
 )
 def view(

@@ -497,7 +497,22 @@ def _first_problem(error: ValidationError) -> str:
         table = ".".join(path[:-1])
         place = f"in [{table}]" if table else "at the top level"
         return f"unknown key '{path[-1]}' {place}. {did_you_mean(path[-1], known)}"
-    return f"{'.'.join(path)}: {problem['msg']} (got {problem['input']!r})."
+    where = _place(problem["loc"])
+    # Where several kinds of value are allowed there is a problem with each of them.
+    same = [_PLAIN.sub(lambda found: PLAIN[found[0]], p["msg"]) for p in error.errors() if _place(p["loc"]) == where]
+    return f"{where}: {', or: '.join(dict.fromkeys(same))} (got {problem['input']!r})."
+
+
+PLAIN = {"a valid tuple": "a list, such as [1, 16]", "a valid dictionary": "a table, such as { name = … }"}
+"""What Python calls things → what they are called in a file."""
+_PLAIN = re.compile("|".join(PLAIN))
+_KIND = re.compile(r"[\[(]|^(str|int|float|bool)$|^constrained-|Config$")
+
+
+def _place(loc: tuple[str | int, ...]) -> str:
+    """Where in the file, as it is written there: pydantic adds which kind of value it tried, and counts from 0."""
+    parts = [part for part in loc if isinstance(part, int) or not _KIND.search(part)]
+    return ".".join(f"value {part + 1}" if isinstance(part, int) else part for part in parts)
 
 
 def _keys_at(path: list[str]) -> list[str]:

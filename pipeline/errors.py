@@ -49,7 +49,7 @@ class StoreError(DemobenchError):
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A sentence that names the closest known word, or lists all of them. Empty when nothing is known."""
-    known = sorted(known)
+    known = sorted(set(known))
     close = get_close_matches(word, known, n=1, cutoff=0.6)
     if close:
         return f"Did you mean '{close[0]}'?"

@@ -317,20 +317,31 @@ def resolve_target(
     )
 
 
-def known_as(argument: str, config: Config, registered: Iterable[str]) -> str:
+def known_as(argument: str, config: Config, registered: Mapping[str, Any]) -> str:
     """The key of a data set that was only ever benchmarked with other settings: `tape` → `tape+3fa9c1d2`.
+
+    Settings that were changed of those (`tape+3fa9c1d2+17ab0c44`) are beside it, and do not take its place.
 
     Raises:
         ConfigError: there are several.
     """
-    if argument in config.datasets or argument in set(registered):
+    if argument in config.datasets or argument in registered:
         return argument
-    variants = sorted(key for key in registered if key.split("+")[0] == argument)
-    if len(variants) > 1:
-        raise ConfigError(
-            f"'{argument}' was benchmarked with several settings: {', '.join(variants)}. Name one of them."
-        )
-    return variants[0] if variants else argument
+    keys = [key for key in registered if key.split("+")[0] == argument]
+    first = min(keys, key=len, default=argument)
+    if all(key == first or key.startswith(f"{first}+") for key in keys):
+        return first
+    described = "; ".join(f"{key} ({_settings_words(registered[key])})" for key in sorted(keys))
+    raise ConfigError(f"'{argument}' was benchmarked with several settings: {described}. Name one of them.")
+
+
+def _settings_words(registered: Mapping[str, Any]) -> str:
+    """What most likely tells one benchmark of a data set from another."""
+    experiment = Experiment.model_validate(registered)
+    families = ", ".join(v.name for v in experiment.variants if v.is_trained and not v.only_when_named)
+    return (
+        f"{experiment.budget_words}, folds {experiment.folds}, {experiment.protocol}: {families or 'baselines alone'}"
+    )
 
 
 def _base(argument: str, config: Config, config_dir: Path, registered: Mapping[str, Any]) -> tuple[str, Experiment]:

@@ -18,9 +18,9 @@ NotNegative = Annotated[float, Field(ge=0)]
 
 
 class MethodSettings(BaseModel):
-    """Base of all: frozen; an unknown name and a number that is not finite are errors."""
+    """Base of all: frozen; an unknown name, a number that is not finite and a number in quotes are errors."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
 
 class TrainingSettings(MethodSettings):

@@ -71,6 +71,26 @@ def test_every_experiment_of_the_docs_is_read(file):
             ["[policies.mlp] sees the observation set 'stat'", "Did you mean 'state'"],
         ),
         (
+            {"policies": {"a": {"method": "mlp", "chunks": 16}}},
+            ["policies.a.chunks: ", "should be a list, such as [1, 16] (got 16)"],
+        ),
+        (
+            {"policies": {"a": {"method": "mlp", "chunks": [1, 0]}}},
+            ["policies.a.chunks.value 2: ", "greater than or equal to 1"],
+        ),
+        (
+            {"datasets": {"tape": {"source": "x", "kind": "torque"}}},
+            [
+                "datasets.tape.kind: Input should be 'auto', or: ",
+                "'position', 'velocity', 'delta' or 'other'",
+                "(got 'torque')",
+            ],
+        ),
+        (
+            {"policies": {"a": {"method": "mlp", "chunks": [1], "settings": {"blocks": "3"}}}},
+            ["[policies.a] settings.blocks", "valid integer"],
+        ),
+        (
             {"policies": {"mlp": {"method": "mlp", "chunks": [1], "datasets": ["so100_sim"]}}},
             ["[policies.mlp] is for the data set 'so100_sim'", "Did you mean 'so101_sim'"],
         ),

@@ -171,12 +171,20 @@ def test_rows_of_other_observation_sets_are_left_out_and_baselines_stay():
 
 def test_a_data_set_is_found_by_its_short_name_as_long_as_there_is_one():
     config = parse_config({"datasets": {"own": {"source": "own"}}}, "file")
-    assert known_as("tape", config, ["tape+1234abcd", "other"]) == "tape+1234abcd"
-    assert known_as("tape", config, ["tape", "tape+1234abcd"]) == "tape"
-    assert known_as("own", config, ["own+1234abcd"]) == "own"
-    assert known_as("nothing", config, ["tape+1234abcd"]) == "nothing"
-    with pytest.raises(ConfigError, match=r"several settings: tape\+a, tape\+b. Name one"):
-        known_as("tape", config, ["tape+b", "tape+a"])
+
+    def known(name, *keys, **more):
+        kept = target().experiment.model_dump(mode="json")
+        return known_as(name, config, {key: kept | more.get(key[-1], {}) for key in keys})
+
+    assert known("tape", "tape+1234abcd", "other") == "tape+1234abcd"
+    assert known("tape", "tape", "tape+1234abcd") == "tape"
+    assert known("own", "own+1234abcd") == "own"
+    assert known("nothing", "tape+1234abcd") == "nothing"
+    assert known("tape", "tape+a", "tape+a+b", "tape+a+b+c") == "tape+a"
+    with pytest.raises(
+        ConfigError, match=r"several settings: tape\+a \(standard .*\); tape\+b \(.*folds 3.*\). Name one"
+    ):
+        known("tape", "tape+b", "tape+a", b={"folds": 3})
 
 
 # Closed loop ----------------------------------------------------------------------------------------------------------

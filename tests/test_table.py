@@ -140,8 +140,9 @@ def test_a_reader_sees_what_the_numbers_rest_on(table):
     for words in (
         "[bold]tape[/]", "px", "mlp_k01", "state", "42 % 28–57", "—", "5 folds, 6 held out", "2 seeds × 5 steps",
         "protocol strict", "95 % interval: bootstrap-t over held-out episodes and seeds, for these folds", "Clopper–Pearson",
-        "floor by radius", "3 comparisons in one family", "no floor of 'state' at the first action: 6 episodes are too few",
-        "against", "Closest to the demonstrations is", "No floor can be given at the first action",
+        "floor by radius", "3 comparisons in one family",
+            "no floor of the RMSE of policies seeing 'state' at the first action: 6 episodes are too few",
+        "against", "Closest to the demonstrations is", "No floor of the RMSE can be given at the first action",
     ):  # fmt: skip
         assert words in text
     assert "left out" not in text

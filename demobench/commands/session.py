@@ -16,6 +16,7 @@ from rich.markup import escape
 from pipeline.config import Config, find_config, load_config
 from pipeline.errors import StoreError
 from pipeline.experiment import Choices, Target, known_as, no_such_dataset, resolve_target
+from pipeline.sinks.words import plural
 from pipeline.store import Store, write_json
 
 if TYPE_CHECKING:
@@ -64,7 +65,8 @@ def tell_mlflow(session: Session, *, first: bool = False) -> None:
     delivery = outbox.deliver()
     if delivery.sent:
         session.console.print(
-            f"MLflow at {outbox.address} was told what was kept for it: {delivery.sent} results.", soft_wrap=True
+            f"MLflow at {outbox.address} was told what was kept for it: {plural(delivery.sent, 'message')}.",
+            soft_wrap=True,
         )
     if delivery.kept and not first:
         session.console.print(

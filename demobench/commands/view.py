@@ -151,9 +151,7 @@ def _why_no_predictions(episode: int, predictions: Sequence[Any], demos: Any, ta
     if not predictions:
         others = [key for key in _with_results(target, session) if key != target.key]
         known = f" There are results of {', '.join(others)}." if others else ""
-        return (
-            f"'{target.key}' has no up-to-date predictions in {session.store.root}; showing the recording alone.{known}"
-        )
+        return f"'{target.key}' has no predictions that are up to date in {session.store.root}; showing the recording alone.{known}"
     anchors = np.concatenate([p.anchors for p in predictions])
     held_out = demos.episode_ids[np.unique(demos.episode_of_frame[anchors])]
     some = ", ".join(map(str, held_out[:10]))

@@ -19,6 +19,7 @@ from pipeline.sinks.findings import (
     families_words,
     family,
     first_step_gap,
+    name_in,
     not_held,
     stopped_words,
     success_words,
@@ -107,13 +108,23 @@ def notes(table: Table) -> list[str]:
     return found
 
 
+def _driven(table: Table) -> str:
+    """Whom the words under a success rate are against."""
+    found = table.get("closed_loop")
+    if not found or not found["comparisons"]:
+        return ""
+    best = "" if found["chosen"] == "champion" else ", which does best there"
+    return f" Those under a success rate are against {name_in(table, found['reference'])} in closed loop{best}."
+
+
 def _tested(table: Table) -> list[str]:
     """What the words in the table rest on, and what is not tested at all."""
     said = []
     if any(row["verdict"]["vs_hold_still"] for row in table["policies"]):
         said.append(
-            f"The words under a number are tests against hold-still at the same horizon: {families_words(table)} The order "
-            "of the other rows is not tested here; demobench compare tests any two of them, or all pairs."
+            f"The words under an error are tests against hold-still at the same horizon: {families_words(table)}"
+            f"{_driven(table)} The order of the other rows is not tested here; demobench compare tests any two of them, or all "
+            "pairs."
         )
     else:
         said.append("No difference between policies is tested here; where intervals overlap the order may be chance.")

@@ -47,7 +47,7 @@ BEST, FLOOR, ELSEWHERE, DRIVEN_ALONE, MORE = (
     "Which policy is best?", "How good can it get?", "What was predicted elsewhere?", "How does it do by itself?",
     "Would more demonstrations help?",
 )  # fmt: skip
-"""What a reader wants to know, in this order."""
+"""What a reader wants to know, in this order; but where a policy succeeds by itself, that comes first."""
 
 
 def answer(table: Table) -> list[Sentence]:
@@ -59,15 +59,18 @@ def answers(table: Table) -> dict[str, list[Sentence]]:
     """The same by the question that it answers; questions that the table has no answer to are left out."""
     rows = [row for row in table["policies"] if is_number(row["first_step_mae"]) and ranks(row)]
     found: dict[str, list[Sentence]] = {}
+    driven = [row for row in table["policies"] if row["rollouts"]]
+    most = max(driven, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]), default=None)
+    alone = {DRIVEN_ALONE: [_best_driven(most), *_driven_verdicts(table, most)]} if most else {}
+    if most and most["rollouts"]["success"]:
+        found |= alone
     if rows:
         best = min(rows, key=lambda row: row["first_step_mae"])
         found[BEST] = [_best(table, best), *_second(table, rows, best), *_against_still(table, rows, best)]
         found[BEST] += _against_champion(table, rows)
         found[FLOOR] = [*_first_step_floor(table, best), *_later_floor(table, best)]
     found[ELSEWHERE] = [_from_elsewhere(table, row) for row in table["policies"] if is_elsewhere(row)]
-    if driven := [row for row in table["policies"] if row["rollouts"]]:
-        most = max(driven, key=lambda row: (row["rollouts"]["success"], row["rollouts"]["score"]))
-        found[DRIVEN_ALONE] = [_best_driven(most), *_driven_verdicts(table, most)]
+    found |= alone
     return {question: sentences for question, sentences in found.items() if sentences}
 
 
@@ -531,8 +534,9 @@ def _first_step_floor(table: Table, best: Row) -> list[Sentence]:
         return [span]
     floor = floors_at_first_step(table)[best["observations"]]
     limit = limit_words(table, floor, bracket_of(table, floor))
-    rest = f" The floor of the RMSE is {limit}." if limit else ""
-    return [[Strong("No floor"), f" can be given at the first action: {why.split(': ')[0]}.{rest}"]]
+    rest = f" It is {limit}." if limit else ""
+    of = f" of the RMSE can be given at the first action for policies seeing {best['observations']}: "
+    return [[Strong("No floor"), f"{of}{why.split(': ')[0]}.{rest}"]]
 
 
 def _first_step_span(table: Table, best: Row) -> Sentence | None:
@@ -562,9 +566,11 @@ def _later_floor(table: Table, best: Row) -> list[Sentence]:
     sees = min(later, key=lambda row: row["at_one_second_mae"], default=best)["observations"]
     found = min(known, key=lambda b: (-b["horizon"], b["observations"] != sees, b["loss"] != "rmse", b["upper"]))
     when, unit, loss = ahead(found["horizon"], table["dataset"]["fps"]), dataset_unit(table), LOSSES[found["loss"]]
-    said = [f"{capital(when)} ", Strong(name_in(table, found["upper_policy"]))]
-    said += [f" reaches {show(found['upper'])}{unit} {loss}, {gap_words(found, unit)}"]
-    return [[*said, f" of policies seeing {found['observations']}."]]
+    said = [
+        f"{capital(when)}, of policies seeing {found['observations']}, ",
+        Strong(name_in(table, found["upper_policy"])),
+    ]
+    return [[*said, f" comes closest to their floor: {show(found['upper'])}{unit} {loss}, {gap_words(found, unit)}."]]
 
 
 def gap_words(bracket: Mapping[str, Any], unit: str = "") -> str:
@@ -574,6 +580,8 @@ def gap_words(bracket: Mapping[str, Any], unit: str = "") -> str:
     low, high = bracket["interval"] or (None, None)
     if low is None:
         return f"{show(bracket['gap'])}{unit} above the floor"
+    if bracket["loss"] != "rmse" and high >= bracket["upper"]:
+        return "how far above the floor cannot be told"
     if bracket["loss"] != "rmse":
         return f"at most {show(high)}{unit} above the floor"
     if low <= 0:

@@ -295,7 +295,10 @@ def _footnotes(table: Mapping[str, Any]) -> list[str]:
             "none where a baseline sees more than the set it stands with"
         )
     lines += elsewhere_words(table)
-    lines += [f"no floor of '{name}' at the first action: {why}" for name, why in without_floor(table).items()]
+    lines += [
+        f"no floor of the RMSE of policies seeing '{name}' at the first action: {why}"
+        for name, why in without_floor(table).items()
+    ]
     if not_held(table):
         lines.append(NOT_HELD)
     radius = table["floor"]["radius"]

@@ -385,9 +385,9 @@ def test_a_run_of_the_command_line_that_fails_is_a_line_in_the_log(served):
     command = [sys.executable, "-m", "demobench.cli", "run", "broken"]
     assert subprocess.run(command, cwd=place, capture_output=True, timeout=300, check=False).returncode == 2
     log = place / "results" / "automation.log"
-    wait_for(log.exists, 120)
+    wait_for(lambda: log.exists() and " broken failed" in log.read_text(encoding="utf-8"), 120)
     (failed,) = [run for run in runs(dagster) if run["partition"] == "broken"]
-    (line,) = log.read_text(encoding="utf-8").splitlines()
+    (line,) = [line for line in log.read_text(encoding="utf-8").splitlines() if " broken " in line]
     assert f" UTC broken failed: demonstrations: {data} cannot be read as parquet" in line
     assert line.endswith(f"(run {failed['runId'][:8]}; to see more: demobench ui, Runs, {failed['runId'][:8]})")
 

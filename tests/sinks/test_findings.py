@@ -3,6 +3,8 @@
 import pytest
 
 from pipeline.sinks.findings import (
+    BEST,
+    DRIVEN_ALONE,
     Command,
     Strong,
     ahead,
@@ -39,7 +41,20 @@ from .making import (
 
 
 def said(table) -> list[str]:
-    return ["".join(sentence) for sentence in answer(table)]
+    """Every sentence, question by question, closed loop last: `answer` has it first where somebody succeeds."""
+    found = answers(table)
+    last = found.pop(DRIVEN_ALONE, [])
+    return ["".join(sentence) for sentence in (*(one for sentences in found.values() for one in sentences), *last)]
+
+
+def test_success_comes_first_and_failure_last(table):
+    assert next(iter(answers(table))) == DRIVEN_ALONE
+    assert "".join(answer(table)[0]).startswith("In closed loop mlp_k04 seeing state succeeds most often: ")
+    for row in table["policies"]:
+        if row["rollouts"]:
+            row["rollouts"] |= {"success": 0.0, "successes": 0}
+    assert next(reversed(answers(table))) == DRIVEN_ALONE
+    assert "".join(answer(table)[0]).startswith("Closest to the demonstrations is ")
 
 
 def test_the_answer_of_a_benchmark(table):
@@ -51,8 +66,9 @@ def test_the_answer_of_a_benchmark(table):
         "It is 1.62 px RMSE above the floor [1.25, 2.00]: for policies seeing state that is 4.00 px RMSE at the first action.",
         "In closed loop mlp_k04 seeing state succeeds most often: 41 of 50 (69–91 %).",
     ]
-    assert Strong("better than hold-still") in answer(table)[0]
-    assert Command("demobench compare small/mlp_k01/state small/mlp_k04/state") in answer(table)[1]
+    closest, second, *_ = answers(table)[BEST]
+    assert Strong("better than hold-still") in closest
+    assert Command("demobench compare small/mlp_k01/state small/mlp_k04/state") in second
 
 
 def test_a_mean_over_columns_of_different_units_has_none(table):
@@ -228,10 +244,10 @@ def test_a_refused_floor_is_said_with_what_is_known(table):
     table["policies"][0]["above_floor"] = []
     table["floor"]["estimates"] = [make_refusal()]
     table["brackets"] = [make_bracket(lower=None)]
-    known = "No floor can be given at the first action: the states differ. The floor of the RMSE is not above 5.62 px, which"
-    assert f"{known} mlp_k01 reaches." in said(table)
+    known = "No floor of the RMSE can be given at the first action for policies seeing state: the states differ. It is not above"
+    assert f"{known} 5.62 px, which mlp_k01 reaches." in said(table)
     table["floor"]["estimates"] = [make_refusal(below=3.3444)]
-    assert any("The floor of the RMSE is not above 3.34 px." in sentence for sentence in said(table))
+    assert any("It is not above 3.34 px." in sentence for sentence in said(table))
     assert without_floor(table) == {"state": "the states differ: too much"}
     assert limit_words(table, make_refusal(below=None), None) == ""
 
@@ -245,9 +261,9 @@ def test_one_sentence_looks_further_ahead(table):
     table["brackets"] += [make_bracket(horizon=10), make_bracket("mae", horizon=10)]
     table["brackets"] += [make_bracket(horizon=5), make_bracket("l2", horizon=12)]
     (found,) = [sentence for sentence in said(table) if "ahead" in sentence]
-    assert (
-        found
-        == "One second ahead mlp_k01 reaches 5.62 px RMSE, 1.62 px [1.25, 2.00] above the floor of policies seeing state."
+    assert found == (
+        "One second ahead, of policies seeing state, mlp_k01 comes closest to their floor: 5.62 px RMSE, "
+        "1.62 px [1.25, 2.00] above the floor."
     )
 
 
@@ -257,6 +273,8 @@ def test_gaps_in_words():
     assert gap_parts(make_gap(gap=-1.0, interval=[-2.0, -0.5])) == ("below", "so the floor is wrong")
     assert gap_parts(make_gap(interval=None)) == ("1.62", "")
     assert gap_words(make_bracket("mae")) == "at most 2.00 above the floor"
+    whole = make_bracket("mae", interval=[0.5, make_bracket()["upper"]])
+    assert gap_words(whole) == "how far above the floor cannot be told"
     assert gap_words(make_bracket(interval=[-0.75, 0.5])) == "at the floor, within ±0.750"
     assert gap_words(make_bracket(lower=None)) == ""
 
