@@ -335,7 +335,7 @@ def said_of_the_table(address: str) -> dict[str, str | bool | None]:
     """What the check `up_to_date` says now."""
     checks = graphql(address, CHECKS)["assetNodeOrError"]["assetChecksOrError"]["checks"]
     found = next(c["executionForLatestMaterialization"] for c in checks if c["name"] == "up_to_date")
-    if found is None:  # a table is being made just now
+    if found is None or found["evaluation"] is None:  # a table is being made just now
         return {"passed": None}
     words = {e["label"]: e.get("text") or e.get("mdStr") for e in found["evaluation"]["metadataEntries"]}
     return words | {"passed": found["evaluation"]["success"]}
