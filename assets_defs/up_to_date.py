@@ -54,6 +54,15 @@ def evaluation(found: Mapping[str, Mapping[str, str]]) -> dg.AssetCheckEvaluatio
     )
 
 
+def _is_unsaid(instance: dg.DagsterInstance) -> bool:
+    """Whether a run that was to say it ended before it did: the UI shows nothing then, until it is said again."""
+    last = instance.get_latest_asset_check_evaluation_record(dg.AssetCheckKey(TABLE, CHECK))
+    if last is None or last.status.value != "PLANNED":
+        return False
+    run = instance.get_run_by_id(last.run_id)
+    return run is None or run.is_finished
+
+
 @dg.sensor(
     name="say_what_is_out_of_date",
     minimum_interval_seconds=60,
@@ -74,6 +83,6 @@ def say_what_is_out_of_date(
             except DemobenchError as error:
                 found[key] = {"demonstrations": str(error)}
     cursor = json.dumps([tables, found])
-    if not found or cursor == context.cursor:
+    if not found or (cursor == context.cursor and not _is_unsaid(context.instance)):
         return dg.SensorResult(skip_reason=dg.SkipReason("nothing changed"), cursor=context.cursor)
     return dg.SensorResult(asset_events=[evaluation(found)], cursor=cursor)

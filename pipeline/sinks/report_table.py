@@ -98,7 +98,7 @@ def _columns(table: Mapping[str, Any]) -> list[Column]:
         ]
     return [
         *columns,
-        Column("Params", "one net, training", lambda row: row["params"], None, _network),
+        Column("Params", "of one net; training of all", lambda row: row["params"], None, _network),
         Column("Latency", "ms a call", lambda row: row["latency_ms"], None, _late, 3),
     ]
 

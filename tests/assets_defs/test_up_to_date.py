@@ -8,7 +8,7 @@ import pytest
 from dagster._core.definitions.data_version import CachingStaleStatusResolver, StaleStatus
 from dagster._core.loader import LoadingContextForTest
 
-from assets_defs.launch import open_instance
+from assets_defs.launch import open_instance, run_benchmark
 from assets_defs.plan import CODE_VERSIONS
 from assets_defs.up_to_date import CHECK, out_of_date, say_what_is_out_of_date
 from pipeline.store import Store
@@ -64,6 +64,16 @@ def test_settings_that_changed_are_said_by_the_check_until_the_results_are_made(
         assert out_of_date(defs.resources["workbench"], "tiny") == {}
         assert unsynced(instance, defs) == set()
         assert said(instance, defs, first.cursor).asset_events[0].passed
+
+
+def test_it_is_said_again_where_a_run_ended_before_it_could_say_it(copy, monkeypatch):
+    defs = served(copy)
+    with open_instance(copy.store.root) as instance:
+        before = said(instance, defs)
+        monkeypatch.setattr("assets_defs.benchmark.record", lambda *_: 1 / 0)
+        assert not run_benchmark(instance, defs, "tiny", [dg.AssetKey(["benchmark_table"])]).is_success
+        (again,) = said(instance, defs, before.cursor).asset_events
+        assert again.passed
 
 
 def test_code_that_changed_is_unsynced_and_in_the_plan(copy, monkeypatch):
