@@ -26,6 +26,8 @@ from pipeline.types import EpisodeErrors, Protocol
 FOLDER = "benchmark_history"
 PAGE, PICTURE = "history.html", "history.png"
 ERRORS = "errors.safetensors"
+NOT_WORSE = ("at_one_second_mae", "success", "score")
+"""What a policy that is better at the first action must not be worse in, to be promoted: a small offline error is not success."""
 SHOWN = ("policy", "observations", "method", "seeds", METRIC, "vs_hold_still")
 
 
@@ -169,21 +171,22 @@ def describe(
 
 
 def promoted(table: Mapping[str, Any], champion: str, eligible: Collection[str]) -> dict[str, Any] | None:
-    """The policy that takes the champion's place: of those that are better at the first action, and not worse one second ahead
-    where both reach it, the one with the smallest error. None where there is none.
+    """The policy that takes the champion's place: of those that are better at the first action, and worse neither one second ahead
+    where both reach it nor in closed loop where both were rolled out, the one with the smallest error. None where there is none.
 
     `eligible` are the addresses of trained policies: in a baseline there would be nothing to watch. One network is not its
     method: two seeds are needed, on both sides.
     """
     rows = {f"{row['policy']}/{row['observations']}": row for row in table["policies"]}
-    found = {(c["a"], c["metric"]): c for c in table["comparisons"] if c["b"] == champion}
+    driven = (table.get("closed_loop") or {}).get("comparisons", ())
+    found = {(c["a"], c["metric"]): c for c in (*table["comparisons"], *driven) if c["b"] == champion}
     better = [
         c
         for (a, metric), c in found.items()
         if metric == METRIC
         and c["word"] == "better"
         and a in eligible
-        and found.get((a, "at_one_second_mae"), {}).get("word") != "worse"
+        and not any(found.get((a, other), {}).get("word") == "worse" for other in NOT_WORSE)
         and not any(_is_one_network(rows[address]) for address in (a, champion))
     ]
     if not better:

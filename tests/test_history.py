@@ -18,7 +18,15 @@ from pipeline.history import (
     regression_words,
 )
 from pipeline.store import Store
-from tests.sinks.making import make_comparison, make_demos, make_row, make_semantics, make_table
+from tests.sinks.making import (
+    make_closed_loop,
+    make_comparison,
+    make_demos,
+    make_driven,
+    make_row,
+    make_semantics,
+    make_table,
+)
 from tests.statistics.test_regression import drawn, errors
 
 DEMOS = make_demos()
@@ -143,6 +151,14 @@ def test_better_now_and_worse_in_a_second_is_no_promotion(store):
     assert made(store, "f1", results(), make_comparison(K04, K01, "better"), ahead).promotion is None
     ahead = make_comparison(K04, K01, "cannot tell", metric="at_one_second_mae")
     assert made(store, "f2", results(), make_comparison(K04, K01, "better"), ahead).promotion["policy"] == K04
+
+
+@pytest.mark.parametrize(("success", "score"), [("worse", "cannot tell"), ("cannot tell", "worse"), ("worse", "worse")])
+def test_better_at_the_first_action_and_worse_in_closed_loop_is_no_promotion(store, success, score):
+    better, driven = make_comparison(K04, K01, "better"), make_closed_loop(*make_driven(K04, K01, success, score))
+    assert made(store, "f1", results(), better, closed_loop=driven).promotion is None
+    driven = make_closed_loop(*make_driven(K04, K01, "cannot tell", "better"))
+    assert made(store, "f2", results(), better, closed_loop=driven).promotion["policy"] == K04
 
 
 def test_one_network_is_not_promoted_over_a_method(store):
