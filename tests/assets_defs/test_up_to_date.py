@@ -38,8 +38,12 @@ def unsynced(instance: dg.DagsterInstance, defs: dg.Definitions, key: str = "tin
 
 
 def said(instance: dg.DagsterInstance, defs: dg.Definitions, cursor: str | None = None) -> dg.SensorResult:
+    """A tick of the sensor; Dagster is told what it found, as by its daemon."""
     workbench = {"workbench": defs.resources["workbench"]}
-    return say_what_is_out_of_date(dg.build_sensor_context(instance=instance, resources=workbench, cursor=cursor))
+    found = say_what_is_out_of_date(dg.build_sensor_context(instance=instance, resources=workbench, cursor=cursor))
+    for event in found.asset_events:
+        instance.report_runless_asset_event(event)
+    return found
 
 
 def test_settings_that_changed_are_said_by_the_check_until_the_results_are_made(copy):

@@ -210,8 +210,8 @@ def test_a_chosen_feature_that_is_no_numbers(tmp_path: Path):
     [
         ({"state": []}, "datasets.mine.state"),
         ({"state": "observation.arm"}, "datasets.mine.state"),
-        ({"exclude": [-1]}, "datasets.mine.exclude.0"),
-        ({"exclude": ["a"]}, "datasets.mine.exclude.0"),
+        ({"exclude": [-1]}, "datasets.mine.exclude.value 1"),
+        ({"exclude": ["a"]}, "datasets.mine.exclude.value 1"),
         ({"features": ["x.parquet"]}, "datasets.mine.features"),
         ({"units": 3}, "datasets.mine.units"),
         ({"excluded": [1]}, "unknown key 'excluded' in .*Did you mean 'exclude'"),
