@@ -329,7 +329,7 @@ SO101_SIM = DatasetConfig(
     },
 )
 
-EMBEDDED = {"pusht_sim": PUSHT_SIM, "so101_sim": SO101_SIM}
+DEFAULT_DATASETS = {"pusht_sim": PUSHT_SIM, "so101_sim": SO101_SIM}
 DEFAULT_POLICIES = {
     "mlp": PolicyConfig(method="mlp", chunks=(1, 4, 16, 32)),
     "recipe": PolicyConfig(
@@ -365,7 +365,7 @@ class Config(Settings):
     store: StoreConfig = StoreConfig()
     tracking: TrackingConfig = TrackingConfig()
     benchmark: BenchmarkConfig = BenchmarkConfig()
-    datasets: dict[str, DatasetConfig] = EMBEDDED
+    datasets: dict[str, DatasetConfig] = DEFAULT_DATASETS
     policies: dict[str, PolicyConfig] = DEFAULT_POLICIES
     schedule: ScheduleConfig = ScheduleConfig()
     notify: NotifyConfig = NotifyConfig()
@@ -431,7 +431,7 @@ def parse_config(raw: dict[str, Any], where: str) -> Config:
 
 def _check_reach(policy: PolicyConfig, config: Config, who: str) -> None:
     """A policy names data sets that there are (those that ship are always there), and observation sets that they have."""
-    there_are = EMBEDDED | config.datasets
+    there_are = DEFAULT_DATASETS | config.datasets
     wanted = config.datasets if policy.datasets == "all" else policy.datasets
     for named in wanted:
         if named not in there_are:

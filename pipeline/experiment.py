@@ -116,10 +116,15 @@ class Experiment(Settings):
         return f"{policy.steps or self.steps:,} steps"
 
     @property
+    def argument(self) -> str:
+        """What the data set is called on a command line that may be given anywhere."""
+        source = self.dataset.source
+        return self.name if source.startswith("embedded:") else source
+
+    @property
     def command(self) -> str:
         """The command line that gives these numbers from anywhere; `--folds` only where it is a number."""
-        source = self.dataset.source
-        words = ["demobench", "run", self.name if source.startswith("embedded:") else source]
+        words = ["demobench", "run", self.argument]
         words += ["--protocol", self.protocol, "--seeds", str(self.seeds), "--steps", str(self.steps)]
         words += ["--folds", str(self.folds)] if self.folds != "auto" else []
         return " ".join(words)

@@ -246,10 +246,14 @@ def _regression(
 
 def in_words(line: Line) -> str:
     """Who the champion is, whether it got worse, and who takes its place."""
-    if line.champion is None:
-        return regression_words(line)
-    said = [f"The champion is {line.champion}.", regression_words(line)]
-    return " ".join([*said, promotion_words(line)] if line.promotion else said)
+    news = news_words(line)
+    return news if line.champion is None else f"The champion is {line.champion}. {news}"
+
+
+def news_words(line: Line) -> str:
+    """Whether the champion got worse, and who takes its place."""
+    worse = regression_words(line)
+    return f"{worse} {promotion_words(line)}" if line.promotion else worse
 
 
 def promotion_words(line: Line) -> str:

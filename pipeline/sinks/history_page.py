@@ -11,11 +11,11 @@ from typing import Any
 
 import altair as alt
 
-from pipeline.history import Line, in_words, promotion_words, regression_words
+from pipeline.history import Line, in_words, news_words
 from pipeline.sinks.drawing import HEIGHT, WIDTH, chart_png, colour_by_policy, inline, number, with_unit
 from pipeline.sinks.markup import Html, element
-from pipeline.sinks.page_style import style_sheet, themed
-from pipeline.sinks.palette import CONFIG, INK, policy_colours
+from pipeline.sinks.page_style import drawn, style_sheet, themed
+from pipeline.sinks.palette import INK, policy_colours
 from pipeline.sinks.report_sections import verdict
 from pipeline.sinks.words import DASH, plural, show, show_interval
 
@@ -152,15 +152,11 @@ def write_history_page(lines: Sequence[Line], path: Path, *, name: str, unit: st
 
 def _chart(lines: Sequence[Line], unit: str | None) -> Html:
     """The chart in the reader's colours, as wide as it is: a narrow screen shows the latest tables and scrolls to the others."""
-    import vl_convert
-
     chart = history_chart(lines, unit=unit, legend=False)
-    looks = themed(CONFIG) | {"background": "transparent"}
-    drawn = vl_convert.vegalite_to_svg(themed(chart.to_dict()), config=looks, allowed_base_urls=[])
     about = f"First-step errors of {plural(min(len(lines), LATEST), 'table')}; the numbers are in the table below"
     words = "Bars are 95 % intervals over held-out episodes and training seeds; a ring marks the champion."
     at_the_left = "direction:ltr;width:max-content;margin:0 auto 0 0"
-    picture = element("div", Html(drawn), role="img", aria_label=about, style=at_the_left)
+    picture = element("div", drawn(themed(chart.to_dict())), role="img", aria_label=about, style=at_the_left)
     # A box that is read from the right is scrolled to its right end.
     box = {
         "class_": "scroll",
@@ -202,18 +198,14 @@ def _rows(lines: Sequence[Line], unit: str | None) -> Html:
             (f"{place + 1}: {line.when[:10]}", f"{line.when[11:16]} UTC"), (line.champion or DASH, None), error,
             (verdict(line.regression and line.regression["word"]), None), _success(row), (_data(line), line.code),
         ]  # fmt: skip
-        drawn = [
+        told = [
             element("td", content, element("small", below) if below else None, data_head=head)
             for head, (content, below) in zip(heads, cells, strict=True)
         ]
-        rows.append(element("tr", drawn, element("td", _said(line), class_="wraps", data_head="what was said")))
+        rows.append(element("tr", told, element("td", news_words(line), class_="wraps", data_head="what was said")))
     names = [element("th", head, class_="left", scope="col") for head in (*heads, "what was said")]
     inner = element("table", element("thead", element("tr", names)), element("tbody", rows))
     return element("div", inner, class_="scroll words", tabindex="0", role="region", aria_label="Every table")
-
-
-def _said(line: Line) -> str:
-    return " ".join([regression_words(line), *([promotion_words(line)] if line.promotion else [])])
 
 
 def _champions_row(line: Line) -> Mapping[str, Any] | None:

@@ -24,6 +24,14 @@ def themed(spec: Any) -> Any:
     return _swap(spec, swaps)
 
 
+def drawn(spec: Any, **looks: Any) -> Html:
+    """A chart as a picture inside the page, in the page's colours; nothing is loaded for it. `looks` are more of Vega's config."""
+    import vl_convert
+
+    config = themed(CONFIG) | {"background": "transparent"} | looks
+    return Html(vl_convert.vegalite_to_svg(spec, config=config, allowed_base_urls=[]))
+
+
 def _swap(value: Any, swaps: dict[str, str]) -> Any:
     if isinstance(value, dict):
         kept = ("datasets", "data", "$schema")

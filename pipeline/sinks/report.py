@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.sinks import explanations, replacing
 from pipeline.sinks.findings import BEST, FLOOR, MORE, Command, Sentence, Strong, answers, key_of
 from pipeline.sinks.markup import Html, element, join, json_for_script, script_text
-from pipeline.sinks.page_style import draw_script, style_sheet, themed
-from pipeline.sinks.palette import CONFIG
+from pipeline.sinks.page_style import draw_script, drawn, style_sheet, themed
 from pipeline.sinks.report_sections import (
     closed_loop_section,
     comparison_section,
@@ -253,15 +252,10 @@ def _figure(figure: "Figure", place: int, specs: Sequence[Mapping[str, Any]]) ->
 @lru_cache(maxsize=64)
 def _still(spec: str) -> Html:
     """A chart as it looks before anything is chosen, in the page's colours; the script draws it again where there is one."""
-    import vl_convert
-
-    config = themed(CONFIG) | {"background": "transparent", "aria": False}
-    drawn = vl_convert.vegalite_to_svg(json.loads(spec), config=config, allowed_base_urls=[])
-    return (
-        Html(drawn)
-        if len(drawn) <= MOST_STILL
-        else element("p", "This picture has too many points to stand here without JavaScript.")
-    )
+    picture = drawn(json.loads(spec), aria=False)
+    if len(picture) <= MOST_STILL:
+        return picture
+    return element("p", "This picture has too many points to stand here without JavaScript.")
 
 
 def _has_menus(spec: Mapping[str, Any]) -> bool:

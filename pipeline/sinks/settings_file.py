@@ -36,15 +36,10 @@ def settings_file(experiment: Experiment) -> str:
 
 def command_is_enough(experiment: Experiment) -> bool:
     """Whether `Experiment.command` gives the same numbers where there is no file: all else is as it is built in."""
-    argument = (
-        experiment.command.split()[2]
-        if experiment.dataset.source.startswith("embedded:")
-        else experiment.dataset.source
-    )
     folds = None if experiment.folds == "auto" else int(experiment.folds)
     choices = Choices(seeds=experiment.seeds, steps=experiment.steps, folds=folds, protocol=experiment.protocol)
     try:
-        plain = resolve_target(argument, Config(), Path.cwd(), choices, {}).experiment
+        plain = resolve_target(experiment.argument, Config(), Path.cwd(), choices, {}).experiment
     except ConfigError:
         return False
     return _means(plain) == _means(experiment)
